@@ -1,0 +1,13 @@
+from ._levenberg_marquardt import LMOptions as LMOptions
+from ._losses import Barron as Barron
+from ._losses import Cauchy as Cauchy
+from ._losses import GemanMcClure as GemanMcClure
+from ._losses import Huber as Huber
+from ._losses import Loss as Loss
+from ._losses import Squared as Squared
+from ._losses import mad_scale as mad_scale
+from ._losses import robustify as robustify
+from ._refinement import Refinement as Refinement
+from ._refinement import refine_absolute_pose as refine_absolute_pose
+from ._window import Window as Window
+from ._window import adjust_window as adjust_window

@@ -1,0 +1,11 @@
+from ._detect import DetectorOptions as DetectorOptions
+from ._detect import Keypoints as Keypoints
+from ._detect import detect as detect
+from ._image import read_image as read_image
+from ._image import to_gray as to_gray
+from ._stereo import StereoMatches as StereoMatches
+from ._stereo import StereoOptions as StereoOptions
+from ._stereo import match_stereo_rows as match_stereo_rows
+from ._track import TrackerOptions as TrackerOptions
+from ._track import Tracks as Tracks
+from ._track import track as track

@@ -1,0 +1,225 @@
+"""Robust camera pose from points and pixels: P3P hypotheses, MSAC, local optimisation, refinement on the inliers.
+
+References: Nistér, Naroditsky & Bergen, "Visual odometry", CVPR 2004; Scaramuzza & Fraundorfer, "Visual odometry, part I",
+2011, section "3-D-to-2-D".
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vojax._result import Result
+from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
+from vojax.ba import Cauchy, LMOptions, refine_absolute_pose
+from vojax.lie import SE3, SO3
+from vojax.solvers import p3p
+
+from ._engine import search
+from ._estimate import Estimate
+from ._options import RansacOptions
+
+
+class AbsolutePoseEstimator(eqx.Module):
+    """Poses as the 12 entries of [R | t], row by row, against points and pixels."""
+
+    points: Float[Array, "n 3"]
+    pixels: Float[Array, "n 2"]
+    bearings: Float[Array, "n 3"]
+    camera: Any
+    limit: float = eqx.field(static=True)
+    local_steps: int = eqx.field(static=True)
+    sample_size: int = eqx.field(static=True, default=3)
+
+    @property
+    def observations(self) -> tuple[Array, ...]:
+        """Components of points and pixels."""
+        return (*(self.points[:, i] for i in range(3)), self.pixels[:, 0], self.pixels[:, 1])
+
+    def hypothesize(self, sample: Int[Array, "m k"]) -> tuple[Float[Array, "12 ks"], Bool[Array, " ks"]]:
+        """P3P on each sample; four lanes for the four slots."""
+        points = jnp.moveaxis(self.points[sample], 1, -1)
+        bearings = jnp.moveaxis(self.bearings[sample], 1, -1)
+        candidates = jax.vmap(p3p, in_axes=-1, out_axes=-1)(points, bearings)
+        parameters = jnp.moveaxis(candidates.models.wxyz_xyz, 1, 0).reshape(7, -1)
+        return _matrix_lanes(parameters), candidates.valid.reshape(-1)
+
+    def squared_error(self, models: Float[Array, "12 *lanes"], observation: tuple[Array, ...]) -> Array:
+        """Squared reprojection error in px²; points behind the camera are infinitely wrong."""
+        x, y, z, u, v = observation
+        xc, yc, zc = (models[4 * i] * x + models[4 * i + 1] * y + models[4 * i + 2] * z + models[4 * i + 3] for i in range(3))
+        pu, pv = self.camera.project_xyz(xc, yc, zc)
+        return jnp.where(zc > 0, (pu - u) * (pu - u) + (pv - v) * (pv - v), jnp.inf)
+
+    def polish(self, model: Float[Array, "12"], inliers: Bool[Array, " n"]) -> Float[Array, "12"]:
+        """A few steps of robust refinement."""
+        pose = _pose(model)
+        refined = refine_absolute_pose(
+            pose,
+            self.points,
+            self.pixels,
+            self.camera,
+            sigma_px=self.limit**0.5 / 3.0,
+            mask=inliers,
+            loss=Cauchy(),
+            options=LMOptions(max_steps=self.local_steps),
+        )
+        return _matrix_lanes(refined.model.wxyz_xyz)
+
+
+def _matrix_lanes(parameters: Float[Array, "7 *lanes"]) -> Float[Array, "12 *lanes"]:
+    """[R | t] from quaternion and translation, in the lanes."""
+    w, x, y, z, tx, ty, tz = parameters
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
+    return jnp.stack(
+        [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy), tx]
+        + [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx), ty]
+        + [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy), tz]
+    )
+
+
+def _pose(model: Float[Array, "12"]) -> SE3:
+    matrix = model.reshape(3, 4)
+    # A search without any hypothesis ends with zeros: give them a rotation.
+    empty = jnp.all(model == 0)
+    rotation = jnp.where(empty, jnp.eye(3, dtype=model.dtype), matrix[:, :3])
+    return SE3.from_rotation_and_translation(SO3.from_matrix(rotation), matrix[:, 3])
+
+
+def estimate_absolute_pose(
+    points_world: Float[ArrayLike, "n 3"],
+    pixels: Float[ArrayLike, "n 2"],
+    camera: Any,
+    *,
+    key: PRNGKeyArray | Array,
+    options: RansacOptions = RansacOptions(),
+    sigma_px: Float[ArrayLike, "..."] | float = 1.0,
+    quality: Float[ArrayLike, " n"] | None = None,
+    mask: Bool[ArrayLike, " n"] | None = None,
+) -> Estimate[SE3]:
+    """Estimate a camera pose from points and their pixels, some of which are wrong.
+
+    Args:
+        points_world: Points, in the world frame.
+        pixels: Where the camera sees them.
+        camera: A camera of `vojax.cameras`.
+        key: Random key; the same key gives the same answer, bit for bit.
+        options: Of the search. Inliers are within `threshold_px` pixels.
+        sigma_px: Noise of the pixels, which scales the covariance and weighs the last refinement: one standard deviation,
+            one for each observation, or covariances `[n, 2, 2]` in px² (for uncertain points add J Σ_X Jᵀ).
+        quality: Of each correspondence, higher is better; guides the sampling.
+        mask: False for padding.
+
+    Returns:
+        `model` is `cam_from_world`; `covariance` that of the camera-frame tangent ξ, translation first, where the state is
+        `world_from_cam @ exp(ξ)`.
+
+    Degenerate input: fewer valid correspondences than four, all points behind the camera or no agreement end with a
+        result code, the identity as model and zero covariance; never NaN.
+    Differentiability: both modes, in points, pixels, camera and noise, through the last refinement by the implicit
+        function theorem with the exact Hessian; the choice of inliers is constant.
+    Raises:
+        ValueError: If shapes do not fit or there are fewer than three correspondences.
+    References: see the module.
+
+    Example:
+        >>> import jax, vojax
+        >>> camera = vojax.cameras.Pinhole(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0, maxval=1.0) + jnp.array([0.0, 0.0, 5.0])
+        >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
+        >>> int(estimate.num_inliers)
+        50
+    """
+    points_world, pixels = jnp.asarray(points_world), jnp.asarray(pixels)
+    n = points_world.shape[0]
+    if points_world.shape != (n, 3) or pixels.shape != (n, 2):
+        raise ValueError(
+            f"points_world has shape {points_world.shape} and pixels {pixels.shape}: expected (n, 3) and (n, 2), one row "
+            "for each correspondence"
+        )
+    if n < 3:
+        raise ValueError(f"{n} correspondences: a pose needs at least 3, and 4 to be unique")
+    return _estimate(points_world, pixels, camera, key, options, sigma_px, quality, mask)
+
+
+@eqx.filter_jit
+def _estimate(
+    points_world: Array, pixels: Array, camera: Any, key: Any, options: RansacOptions, sigma_px: Any, quality: Any, mask: Any
+) -> Estimate[SE3]:
+    n = points_world.shape[0]
+    finite = jnp.all(jnp.isfinite(points_world), axis=1) & jnp.all(jnp.isfinite(pixels), axis=1)
+    mask = finite if mask is None else finite & jnp.asarray(mask)
+    points_world = jnp.where(mask[:, None], points_world, 0.0)
+    pixels = jnp.where(mask[:, None], pixels, 0.0)
+    count = jnp.sum(mask)
+
+    # Hypotheses live in float32 and about the centre of the points, wherever the world's origin is.
+    center = jax.lax.stop_gradient(jnp.sum(points_world, axis=0) / jnp.maximum(count, 1).astype(points_world.dtype))
+    centered = jnp.where(mask[:, None], points_world - center[None], 0.0)
+    local, local_pixels, local_camera = jax.tree.map(
+        lambda x: jax.lax.stop_gradient(x).astype(jnp.float32), (centered, pixels, camera)
+    )
+    estimator = AbsolutePoseEstimator(
+        local,
+        local_pixels,
+        local_camera.unproject(local_pixels),
+        local_camera,
+        limit=options.threshold_px**2,
+        local_steps=options.local_steps,
+    )
+    found = search(
+        estimator, mask, None if quality is None else jax.lax.stop_gradient(jnp.asarray(quality)), key, options
+    )
+
+    dtype = points_world.dtype
+    shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)
+    start = SE3(_pose(found.model).wxyz_xyz.astype(dtype))
+    # Once more on the inliers of the refined pose, which is where the estimate differentiates.
+    first = refine_absolute_pose(
+        jax.lax.stop_gradient(start),
+        *jax.lax.stop_gradient((centered, pixels, camera)),
+        sigma_px=jax.lax.stop_gradient(sigma_px),
+        mask=found.inliers,
+        options=LMOptions(max_steps=options.local_steps),
+    ).model
+    inliers, _ = _judge(first, centered, pixels, camera, mask, options)
+    inliers = jnp.where(jnp.sum(inliers) >= jnp.sum(found.inliers), inliers, found.inliers)
+    refined = refine_absolute_pose(
+        first,
+        centered,
+        pixels,
+        camera,
+        sigma_px=sigma_px,
+        mask=inliers,
+        options=LMOptions(max_steps=options.final_steps),
+    )
+    inliers_after, score = _judge(refined.model, centered, pixels, camera, mask, options)
+    num_inliers = jnp.sum(inliers_after)
+    result = Result.where(num_inliers > 3, refined.result, Result.no_consensus)
+    result = Result.where(count >= 4, result, Result.too_few)
+    usable = (result == Result.success) | (result == Result.not_converged)
+    model = refined.model @ shift
+    model = SE3(jnp.where(usable, model.wxyz_xyz, SE3.identity(dtype=dtype).wxyz_xyz))
+    return Estimate(
+        model,
+        inliers_after & usable,
+        jnp.where(usable, num_inliers, 0),
+        jnp.where(usable, score, count.astype(dtype)),
+        found.num_hypotheses,
+        jnp.where(usable, refined.covariance, 0.0),
+        result,
+    )
+
+
+def _judge(
+    model: SE3, points: Array, pixels: Array, camera: Any, mask: Array, options: RansacOptions
+) -> tuple[Array, Array]:
+    """Inliers and score at a pose, in the caller's precision; constants for differentiation."""
+    model, points, pixels, camera = jax.lax.stop_gradient((model, points, pixels, camera))
+    points_cam = model.apply(points)
+    error = camera.project(points_cam) - pixels
+    squared = jnp.where(points_cam[:, 2] > 0, jnp.sum(error * error, axis=1), jnp.inf)
+    limit = options.threshold_px**2
+    return mask & (squared <= limit), jnp.sum(jnp.where(mask, jnp.minimum(squared / limit, 1.0), 0.0))

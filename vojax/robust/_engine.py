@@ -1,0 +1,138 @@
+"""Batched RANSAC: thousands of hypotheses at once, on any estimator.
+
+Draw a chunk of minimal samples, solve them in the lanes, judge all on a subset of the observations and the survivors on
+all of them, keep the best few; stop when confident. Then polish the best few and return the best of those. Everything
+here sees constants only: derivatives belong to the last refinement, which is the caller's.
+
+References: Fischler & Bolles, "Random sample consensus", 1981; Chum, Matas & Kittler, "Locally optimized RANSAC", 2003.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vojax._types import Array, Bool, Float, Int
+
+from ._options import RansacOptions
+from ._sampling import draw_samples, guided_pool, random_uniform, required_hypotheses, sampling_order
+from ._scoring import msac_scores
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """A kind of model, with the observations it is estimated from. A pytree; models are vectors of `d` numbers."""
+
+    sample_size: int
+    limit: float
+    observations: tuple[Array, ...]
+
+    def hypothesize(self, sample: Int[Array, "m k"]) -> tuple[Float[Array, "d ks"], Bool[Array, " ks"]]:
+        """Solve minimal samples; the solutions of one sample stand in different lanes."""
+        ...
+
+    def squared_error(self, models: Float[Array, "d *lanes"], observation: tuple[Array, ...]) -> Array:
+        """Squared error of models against observations, elementwise; infinite or large where impossible."""
+        ...
+
+    def polish(self, model: Float[Array, " d"], inliers: Bool[Array, " n"]) -> Float[Array, " d"]:
+        """Improve one model on its inliers."""
+        ...
+
+
+class Consensus(eqx.Module):
+    """The best model of a search."""
+
+    model: Float[Array, " d"]
+    inliers: Bool[Array, " n"]
+    score: Float[Array, ""]
+    num_hypotheses: Int[Array, ""]
+
+
+class _State(eqx.Module):
+    chunk: Int[Array, ""]
+    models: Float[Array, "d top"]
+    scores: Float[Array, " top"]
+    required: Float[Array, ""]
+
+
+def search(
+    estimator: Estimator,
+    mask: Bool[Array, " n"],
+    quality: Float[Array, " n"] | None,
+    key: Any,
+    options: RansacOptions,
+) -> Consensus:
+    """Find the model with the lowest truncated error.
+
+    Args:
+        estimator: What is estimated from what.
+        mask: Observations that count.
+        quality: Higher is better; samples are then drawn from the best observations first.
+        key: Random key. The same key gives the same answer, bit for bit.
+        options: Settings.
+
+    Returns:
+        The polished consensus. Without any valid hypothesis the model is zero and nothing is an inlier.
+    """
+    n = mask.shape[0]
+    m, k = estimator.sample_size, min(options.chunk_size, options.max_hypotheses)
+    dtype = estimator.observations[0].dtype
+    count = jnp.sum(mask).astype(jnp.int32)
+    weights = mask.astype(dtype)
+    order = sampling_order(mask, quality)
+    # The coarse subset is a fixed random choice among the observations that count.
+    shuffled = jnp.argsort(jnp.where(mask, jax.random.uniform(jax.random.fold_in(key, -1), (n,)), jnp.inf))
+    coarse = shuffled[: min(options.coarse_points, n)]
+    coarse_observations = tuple(component[coarse] for component in estimator.observations)
+    num_chunks = -(-options.max_hypotheses // k)
+
+    def scores_of(models: Array, observations: Any, weights: Array) -> Array:
+        return msac_scores(estimator.squared_error, models, observations, weights, estimator.limit)
+
+    def body(state: _State) -> _State:
+        drawn = state.chunk * k + jnp.arange(k)
+        pool = count if quality is None else guided_pool(drawn, count, m, options.max_hypotheses)
+        sample = draw_samples(random_uniform(key, state.chunk, (m, k)), order, pool)
+        models, valid = estimator.hypothesize(sample)
+        coarse_scores = scores_of(models, coarse_observations, weights[coarse])
+        coarse_scores = jnp.where(valid, coarse_scores, jnp.inf)
+        best, kept = jax.lax.top_k(-coarse_scores, min(options.survivors, models.shape[1]))
+        survivors = models[:, kept]
+        scores = jnp.where(jnp.isfinite(best), scores_of(survivors, estimator.observations, weights), jnp.inf)
+        merged, merged_scores = jnp.concatenate([state.models, survivors], 1), jnp.concatenate([state.scores, scores])
+        negative, top = jax.lax.top_k(-merged_scores, options.top_k)
+        inliers = jnp.sum(_inliers(estimator, merged[:, top[0]], mask))
+        ratio = inliers / jnp.maximum(count, 1)
+        required = required_hypotheses(ratio.astype(dtype), m, options.confidence)
+        required = jnp.where(jnp.isfinite(negative[0]), required, jnp.inf)
+        return _State(state.chunk + 1, merged[:, top], -negative, required)
+
+    def unfinished(state: _State) -> Array:
+        return (state.chunk < num_chunks) & (state.chunk * k < state.required) & (count >= m)
+
+    d = jax.eval_shape(estimator.hypothesize, jax.ShapeDtypeStruct((m, k), jnp.int32))[0].shape[0]
+    state = _State(
+        jnp.zeros((), jnp.int32),
+        jnp.zeros((d, options.top_k), dtype),
+        jnp.full((options.top_k,), jnp.inf, dtype),
+        jnp.asarray(jnp.inf, dtype),
+    )
+    state = jax.lax.while_loop(unfinished, body, state)
+
+    polished = jax.vmap(lambda model: estimator.polish(model, _inliers(estimator, model, mask)), -1, -1)(state.models)
+    models = jnp.concatenate([polished, state.models], axis=1)
+    found = jnp.tile(jnp.isfinite(state.scores), 2)
+    scores = jnp.where(found, scores_of(models, estimator.observations, weights), jnp.inf)
+    best = jnp.argmin(scores)
+    any_found = found[best]
+    model = jnp.where(any_found, models[:, best], 0.0)
+    inliers = _inliers(estimator, model, mask) & any_found
+    score = jnp.where(any_found, scores[best], count.astype(dtype))
+    return Consensus(model, inliers, score, state.chunk * k)
+
+
+def _inliers(estimator: Estimator, model: Float[Array, " d"], mask: Bool[Array, " n"]) -> Bool[Array, " n"]:
+    errors = estimator.squared_error(model[:, None], estimator.observations)
+    return mask & (errors <= estimator.limit)

@@ -1,0 +1,42 @@
+"""Settings of robust estimation."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class RansacOptions:
+    """How many hypotheses are drawn, how they are judged and how the best are polished.
+
+    Attributes:
+        threshold_px: Largest reprojection error of an inlier, in pixels.
+        threshold: Largest distance of an inlier in scene units, where points are compared with points.
+        confidence: Probability with which at least one sample was free of outliers when drawing stops.
+        max_hypotheses: Most minimal samples drawn.
+        chunk_size: Samples drawn and scored together.
+        coarse_points: Observations that judge every hypothesis; all observations judge the best of them.
+        survivors: Hypotheses of a chunk that all observations judge.
+        top_k: Best hypotheses that local optimisation polishes.
+        local_steps: Steps of that optimisation.
+        final_steps: Most steps of the last refinement.
+    """
+
+    threshold_px: float = 3.0
+    threshold: float = 0.05
+    confidence: float = 0.9999
+    max_hypotheses: int = 4096
+    chunk_size: int = 256
+    coarse_points: int = 128
+    survivors: int = 64
+    top_k: int = 8
+    local_steps: int = 5
+    final_steps: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("threshold_px", "threshold"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: expected a positive number")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence is {self.confidence}: expected a probability between 0 and 1, both excluded")
+        for name in ("max_hypotheses", "chunk_size", "coarse_points", "survivors", "top_k", "local_steps", "final_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")

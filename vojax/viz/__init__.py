@@ -1,0 +1,3 @@
+from ._figure import save_figure as save_figure
+from ._tracks import draw_tracks as draw_tracks
+from ._trajectory import plot_trajectory as plot_trajectory
