@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from ._types import Array, Float
+from ._types import Array, Bool, Float
 
 
 def tiny(x: Float[Array, "..."]) -> float:
@@ -53,75 +53,61 @@ def cross3(a: Vector3, b: Vector3) -> Vector3:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def cholesky_factor(matrix: Sequence[Sequence[Array]]) -> tuple[list[list[Array]], list[Array], Array]:
-    """Factor a small positive semidefinite matrix M = L Lᵀ, unrolled.
+def cholesky_factor(matrix: Float[Array, "d d *lanes"]) -> tuple[list[Array], list[Array], Array]:
+    """Factor small positive semidefinite matrices M = L Lᵀ, one column after the other.
+
+    Whole columns are updated at once: unrolled to scalars, the same arithmetic takes a compiler tens of times longer.
 
     Args:
-        matrix: Entries `matrix[i][j]`; only the lower triangle (j <= i) is read.
+        matrix: Symmetric matrices, batch on the trailing axes.
 
     Returns:
-        The rows of L; the inverses of its diagonal; and a mask that is False where M is singular to working precision.
-        There the offending pivots and their inverses are 0, so that solutions stay finite and have no component along
-        directions without information.
+        The columns of L, from the diagonal down `[d − k, *lanes]`; the inverses of its diagonal; and a mask that is False
+        where M is singular to working precision. There the offending columns and their inverses are 0, so that solutions
+        stay finite and have no component along directions without information.
     """
-    size = len(matrix)
-    rows: list[list[Array]] = []
+    size = matrix.shape[0]
+    diagonal = [matrix[k, k] for k in range(size)]
+    columns: list[Array] = []
     inverse_pivots: list[Array] = []
-    regular = jnp.isfinite(matrix[0][0])
-    for i in range(size):
-        row: list[Array] = []
-        for j in range(i):
-            entry = matrix[i][j]
-            for k in range(j):
-                entry = entry - row[k] * rows[j][k]
-            row.append(entry * inverse_pivots[j])
-        pivot = matrix[i][i]
-        for k in range(i):
-            pivot = pivot - row[k] * row[k]
+    regular = jnp.isfinite(diagonal[0])
+    rest = matrix
+    for k in range(size):
+        pivot = rest[0, 0]
         # Below the rounding error of the diagonal entry that it came from, a pivot is noise.
-        positive = pivot > 2 * size * float(jnp.finfo(pivot.dtype).eps) * jnp.abs(matrix[i][i])
-        root = jnp.sqrt(jnp.where(positive, pivot, 1.0))
-        row.append(jnp.where(positive, root, 0.0))
-        rows.append(row)
-        inverse_pivots.append(jnp.where(positive, 1.0 / root, 0.0))
+        positive = pivot > 2 * size * float(jnp.finfo(pivot.dtype).eps) * jnp.abs(diagonal[k])
+        inverse = jnp.where(positive, 1.0 / jnp.sqrt(jnp.where(positive, pivot, 1.0)), 0.0)
+        column = rest[:, 0] * inverse[None]
+        rest = rest[1:, 1:] - column[1:, None] * column[None, 1:]
+        columns.append(column)
+        inverse_pivots.append(inverse)
         regular = regular & positive
-    return rows, inverse_pivots, regular
+    return columns, inverse_pivots, regular
 
 
-def cholesky_solve(matrix: Sequence[Sequence[Array]], *right_hand_sides: Sequence[Array]) -> tuple[list[Array], ...]:
-    """Solve a small symmetric positive definite system for one or more right-hand sides, unrolled.
-
-    Args:
-        matrix: Entries `matrix[i][j]`; only the lower triangle (j <= i) is read.
-        right_hand_sides: Entries of each right-hand side.
+def cholesky_solve(
+    matrix: Float[Array, "d d *lanes"], rhs: Float[Array, "d r *lanes"]
+) -> tuple[Float[Array, "d r *lanes"], Bool[Array, "*lanes"]]:
+    """Solve small symmetric positive definite systems; see `cholesky_factor` for singular ones.
 
     Returns:
-        One solution for each right-hand side, then the mask of `cholesky_factor` as the last element.
+        The solutions, and the mask of systems that are regular.
     """
-    rows, inverse_pivots, regular = cholesky_factor(matrix)
-    size = len(rows)
-    solutions: list[list[Array]] = []
-    for rhs in right_hand_sides:
-        forward: list[Array] = []
-        for i in range(size):
-            entry = rhs[i]
-            for k in range(i):
-                entry = entry - rows[i][k] * forward[k]
-            forward.append(entry * inverse_pivots[i])
-        solution = list(forward)
-        for i in reversed(range(size)):
-            entry = forward[i]
-            for k in range(i + 1, size):
-                entry = entry - rows[k][i] * solution[k]
-            solution[i] = entry * inverse_pivots[i]
-        solutions.append(solution)
-    return (*solutions, regular)  # type: ignore[return-value]
+    columns, inverse_pivots, regular = cholesky_factor(matrix)
+    forward: list[Array] = []
+    rest = rhs
+    for column, inverse in zip(columns, inverse_pivots, strict=True):
+        entry = rest[0] * inverse[None]
+        rest = rest[1:] - column[1:, None] * entry[None]
+        forward.append(entry)
+    solution = jnp.zeros_like(rhs[:0])
+    for column, inverse, entry in zip(columns[::-1], inverse_pivots[::-1], forward[::-1], strict=True):
+        entry = (entry - jnp.sum(column[1:, None] * solution, axis=0)) * inverse[None]
+        solution = jnp.concatenate([entry[None], solution])
+    return solution, regular
 
 
-def symmetric_inverse(matrix: Sequence[Sequence[Array]]) -> tuple[Float[Array, "d d *shape"], Array]:
-    """Invert a small positive definite matrix given by its lower triangle, and say whether it could be inverted."""
-    size = len(matrix)
-    one, zero = jnp.ones_like(matrix[0][0]), jnp.zeros_like(matrix[0][0])
-    units = [[one if i == j else zero for i in range(size)] for j in range(size)]
-    *columns, regular = cholesky_solve(matrix, *units)
-    return jnp.stack([jnp.stack(column) for column in columns]), regular  # type: ignore[arg-type]
+def symmetric_inverse(matrix: Float[Array, "d d *lanes"]) -> tuple[Float[Array, "d d *lanes"], Bool[Array, "*lanes"]]:
+    """Invert small positive definite matrices, and say which could be inverted."""
+    identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(matrix.shape[:2] + (1,) * (matrix.ndim - 2))
+    return cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape))

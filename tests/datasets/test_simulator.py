@@ -98,9 +98,7 @@ def test_rigid_moves_points(dtype, scale):
     assert np.median(np.linalg.norm(residual[~inliers], axis=1)) > 2
 
 
-@pytest.mark.parametrize(
-    ("motion", "along"), [("forward", 2), ("turning", 2), ("sideways", 0), ("random", None)]
-)
+@pytest.mark.parametrize(("motion", "along"), [("forward", 2), ("turning", 2), ("sideways", 0), ("random", None)])
 def test_motion_profiles(motion, along):
     poses = motion_profile(80, key=KEY, motion=motion, step=0.8)
     matrix = _matrix(poses)
@@ -147,5 +145,5 @@ def test_one_frame_and_other_bad_input():
     assert motion_profile(1, key=KEY).wxyz_xyz.shape == (1, 7)
     with pytest.raises(ValueError, match="frames is 0"):
         motion_profile(0, key=KEY)
-    with pytest.raises(ValueError, match="outlier_fraction is 1.5"):
+    with pytest.raises(ValueError, match=r"outlier_fraction is 1\.5"):
         simulate_absolute_pose(KEY, 5, outlier_fraction=1.5)

@@ -1,6 +1,5 @@
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -17,7 +16,7 @@ def exact(dtype):
 @functools.partial(jax.jit, static_argnums=0)
 def round_trip(group, xi):
     T = group.exp(xi)
-    negated = eqx.tree_at(lambda t: t.parameters(), T, T.parameters().at[..., :4].multiply(-1.0))
+    negated = group(T.parameters().at[..., :4].multiply(-1.0))
     return T.parameters(), T.as_matrix(), T.log(), negated.log(), group.from_matrix(T.as_matrix()).as_matrix()
 
 
@@ -48,7 +47,7 @@ def test_agrees_with_jaxlie(ours, theirs, dtype, tangents, values):
         xi, eta = xi[both], eta[both]
     points = jnp.asarray(np.random.default_rng(2).normal(size=(len(xi), 3)), dtype)
 
-    def everything(group, dimension):
+    def everything(group):
         def one(x, y, p):
             T, S = group.exp(x), group.exp(y)
             return {
@@ -64,10 +63,10 @@ def test_agrees_with_jaxlie(ours, theirs, dtype, tangents, values):
 
         return jax.jit(jax.vmap(one))
 
-    found = everything(ours, 3)(xi, eta, points)
+    found = everything(ours)(xi, eta, points)
     # The oracle always runs in float64, on the same rounded inputs.
     with jax.enable_x64(True):
-        expected = everything(theirs, 3)(*(jnp.asarray(values(x)) for x in (xi, eta, points)))
+        expected = everything(theirs)(*(jnp.asarray(values(x)) for x in (xi, eta, points)))
     for name, value in found.items():
         assert value.dtype == dtype, name
         np.testing.assert_allclose(values(value), values(expected[name]), rtol=0, atol=5 * exact(dtype), err_msg=name)
@@ -195,7 +194,7 @@ def test_accessors_and_constructors():
 
 def test_normalize_restores_unit_quaternions(group):
     T = group.sample_uniform(jax.random.key(10), (5,))
-    stretched = eqx.tree_at(lambda t: t.parameters(), T, T.parameters().at[:, :4].multiply(1.7))
+    stretched = group(T.parameters().at[:, :4].multiply(1.7))
     np.testing.assert_allclose(stretched.normalize().parameters(), T.parameters(), atol=1e-6)
     zero = group(jnp.zeros(group.parameters_dim)).normalize().parameters()
     np.testing.assert_array_equal(zero[:4], [1.0, 0.0, 0.0, 0.0])

@@ -11,28 +11,26 @@ from vojax.lie import SE3, SO3, Sim3, interpolate
 
 
 def everything(group, xi):
-    """All functions of a tangent, in one vector."""
+    """The functions of a tangent that have branches, in one vector."""
     T = group.exp(xi)
     parts = [
         T.parameters(),
         T.log(),
         group.from_matrix(T.as_matrix()).parameters(),
-        T.inverse().parameters(),
-        T.adjoint(),
-        T.normalize().parameters(),
-        group.jacobian_left(xi),
-        group.jacobian_right_inverse(xi),
-        interpolate(group.identity(dtype=xi.dtype), T, 0.3).parameters(),
+        group.jacobian_left_inverse(xi),
         interpolate(T, T, 0.3).parameters(),
-        interpolate(T, T.inverse(), 0.5).log(),
+        interpolate(T, T.inverse(), 0.25).parameters(),
     ]
     return jnp.concatenate([part.ravel() for part in parts])
 
 
+# One shape and few compilations per group: this file would otherwise be the slowest of the folder.
 @functools.cache
-def compiled(group):
+def compiled(group, mode):
     function = functools.partial(everything, group)
-    return jax.jit(jax.vmap(lambda x: (function(x), jax.jacfwd(function)(x), jax.jacrev(function)(x))))
+    return jax.jit(
+        jax.vmap({"value": function, "forward": jax.jacfwd(function), "reverse": jax.jacrev(function)}[mode])
+    )
 
 
 def special_tangents(group):
@@ -52,46 +50,34 @@ def special_tangents(group):
     return np.concatenate(rows)
 
 
-def test_values_and_gradients_finite_in_float32(group):
+@pytest.mark.parametrize("mode", ["value", "forward", "reverse"])
+def test_finite_in_float32(group, mode):
     xi = jnp.asarray(special_tangents(group), jnp.float32)
-    for name, result in zip(("value", "forward", "reverse"), compiled(group)(xi), strict=True):
-        bad = ~np.isfinite(np.asarray(result)).reshape(len(xi), -1).all(axis=1)
-        assert not bad.any(), f"{name} not finite at {np.asarray(xi)[bad][:3]}"
+    bad = ~np.isfinite(np.asarray(compiled(group, mode)(xi))).reshape(len(xi), -1).all(axis=1)
+    assert not bad.any(), f"not finite at {np.asarray(xi)[bad][:3]}"
 
 
-def test_float32_gradients_match_float64(group):
-    # Away from half a turn, where one float32 step of the input may choose the other sign of the axis, and whole turns.
+def away_from_half_turns(group):
+    # interpolate(T, T⁻¹) doubles the angle; at half a turn the two sides of a difference may take different ways round.
     xi = special_tangents(group)
     angle = np.linalg.norm(xi[:, 3:6] if group is not SO3 else xi, axis=1)
-    # interpolate(T, T⁻¹) doubles the angle.
-    xi = np.float32(np.where((angle < 1.5)[:, None], xi, 0.0))
-    single = compiled(group)(jnp.asarray(xi))
-    with jax.enable_x64(True):
-        double = [np.asarray(x) for x in compiled(group)(jnp.asarray(xi, jnp.float64))]
-    for mine, reference in zip(single, double, strict=True):
-        scale = np.maximum(1.0, np.abs(reference).max())
-        np.testing.assert_allclose(np.asarray(mine) / scale, reference / scale, rtol=0, atol=1e-5)
+    return np.where((angle < 1.5)[:, None], xi, 0.0)
 
 
-def test_gradients_against_central_differences(group, x64):
-    xi = special_tangents(group)
-    angle = np.linalg.norm(xi[:, 3:6] if group is not SO3 else xi, axis=1)
-    xi = jnp.asarray(xi[angle < 1.5])
-    _, forward, reverse = compiled(group)(xi)
+def test_slopes_against_central_differences(group, dtype):
+    xi = away_from_half_turns(group).astype(dtype)
+    found = {mode: np.asarray(compiled(group, mode)(xi), np.float64) for mode in ("forward", "reverse")}
     step = 1e-5
-    offsets = step * np.eye(group.tangent_dim)
-    columns = []
-    for offset in offsets:
-        up, down = (compiled_value(group)(xi + sign * offset[None]) for sign in (1.0, -1.0))
-        columns.append(np.asarray(up - down) / (2 * step))
-    expected = np.stack(columns, axis=-1)
-    np.testing.assert_allclose(forward, expected, rtol=1e-8, atol=3e-8)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-12, atol=1e-12)
-
-
-@functools.cache
-def compiled_value(group):
-    return jax.jit(jax.vmap(functools.partial(everything, group)))
+    with jax.enable_x64(True):
+        value = compiled(group, "value")
+        offsets = step * np.eye(group.tangent_dim)
+        pairs = [
+            [np.asarray(value(jnp.asarray(xi + sign * e[None], jnp.float64))) for sign in (1, -1)] for e in offsets
+        ]
+    expected = np.stack([(up - down) / (2 * step) for up, down in pairs], axis=-1)
+    scale = max(1.0, np.abs(expected).max())
+    for slope in found.values():
+        np.testing.assert_allclose(slope / scale, expected / scale, atol=1e-5 if dtype is jnp.float32 else 2e-9)
 
 
 def test_log_undoes_exp_with_unit_slope(group):
@@ -104,21 +90,23 @@ def test_log_undoes_exp_with_unit_slope(group):
     np.testing.assert_allclose(slope, np.broadcast_to(np.eye(group.tangent_dim), slope.shape), rtol=0, atol=2e-5)
 
 
-def test_second_derivatives_finite_at_identity(group):
-    def cost(x):
-        return jnp.sum(everything(group, x) ** 2)
+@pytest.mark.parametrize("group", [SO3, SE3])
+def test_second_derivatives_at_identity(group):
+    def squared_distance(x):
+        return 0.5 * jnp.sum(group.exp(x).log() ** 2)
 
-    hessian = jax.jit(jax.hessian(cost))(jnp.zeros(group.tangent_dim))
-    assert bool(jnp.isfinite(hessian).all())
+    hessian = jax.jit(jax.hessian(squared_distance))(jnp.zeros(group.tangent_dim))
+    np.testing.assert_allclose(hessian, np.eye(group.tangent_dim), atol=1e-6)
 
 
-@hypothesis.settings(max_examples=60, deadline=None, derandomize=True)
+@hypothesis.settings(max_examples=40, deadline=None, derandomize=True)
 @hypothesis.given(st.lists(st.floats(-7, 7, width=32), min_size=7, max_size=7))
 def test_any_tangent_is_finite(numbers):
-    for group in (SO3, SE3, Sim3):
-        xi = jnp.asarray(numbers[-group.tangent_dim :], jnp.float32)
-        for result in compiled(group)(xi[None]):
-            assert bool(jnp.isfinite(result).all())
+    for group in (SO3, SE3):
+        shape = special_tangents(group).shape
+        xi = jnp.asarray(np.broadcast_to(np.float32(numbers[-group.tangent_dim :]), shape))
+        for mode in ("value", "reverse"):
+            assert bool(jnp.isfinite(compiled(group, mode)(xi)[0]).all())
 
 
 @pytest.mark.parametrize("quaternion", [[0, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [-1e-20, 0, 0, 1]])

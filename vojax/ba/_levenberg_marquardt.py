@@ -87,12 +87,12 @@ class NielsenSearch(optx.AbstractSearch):
 
 
 class _DenseState(eqx.Module):
-    hessian: tuple[tuple[Array, ...], ...]
-    gradient: tuple[Array, ...]
+    hessian: Float[Array, "d d"]
+    gradient: Float[Array, " d"]
 
 
 class DenseDescent(optx.AbstractDescent):
-    """Solve the damped normal equations of a few variables by an unrolled Cholesky factorisation.
+    """Solve the damped normal equations of a few variables by a Cholesky factorisation of our own.
 
     A direction without curvature gets no step; the result is always finite and successful, and the search judges it.
     """
@@ -100,27 +100,21 @@ class DenseDescent(optx.AbstractDescent):
     def init(self, y: Any, f_info_struct: Any) -> _DenseState:
         """Zeros of the right shape."""
         del f_info_struct
-        zero = jnp.zeros((), y.dtype)
-        return _DenseState(tuple((zero,) * (i + 1) for i in range(y.shape[0])), (zero,) * y.shape[0])
+        return _DenseState(jnp.zeros((y.shape[0], y.shape[0]), y.dtype), jnp.zeros_like(y))
 
     def query(self, y: Any, f_info: Any, state: _DenseState) -> _DenseState:
         """Form JᵀJ and Jᵀr at a newly accepted point."""
         del state
-        size = y.shape[0]
-        columns = [f_info.jac.mv(jnp.zeros_like(y).at[i].set(1.0)) for i in range(size)]
-        hessian = tuple(tuple(_dot(columns[i], columns[j]) for j in range(i + 1)) for i in range(size))
-        gradient = tuple(_dot(column, f_info.residual) for column in columns)
-        return _DenseState(hessian, gradient)
+        columns = jnp.stack([f_info.jac.mv(jnp.zeros_like(y).at[i].set(1.0)) for i in range(y.shape[0])])
+        hessian = jnp.sum(columns[:, None] * columns[None], axis=-1)
+        return _DenseState(hessian, jnp.sum(columns * f_info.residual[None], axis=-1))
 
     def step(self, step_size: Any, state: _DenseState) -> tuple[Any, optx.RESULTS]:
         """Solve for the increment at damping 1/step_size."""
-        size = len(state.gradient)
-        damped = [
-            [entry * (1.0 + 1.0 / step_size) if i == j else entry for j, entry in enumerate(row)]
-            for i, row in enumerate(state.hessian)
-        ]
-        increment, _ = cholesky_solve(damped, [-state.gradient[i] for i in range(size)])
-        return jnp.stack(increment), optx.RESULTS.successful
+        identity = jnp.eye(state.gradient.shape[0], dtype=state.gradient.dtype)
+        damped = state.hessian * (1.0 + identity / step_size)
+        increment, _ = cholesky_solve(damped, -state.gradient[:, None])
+        return increment[:, 0], optx.RESULTS.successful
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):

@@ -15,7 +15,7 @@ from vojax._numerics import symmetric_inverse
 from vojax._result import Result
 from vojax._types import Array, ArrayLike, Bool, Float, Int
 from vojax.lie import SE3
-from vojax.solvers import Candidates, implicit, retract_camera
+from vojax.solvers import Candidates, implicit, perturb_camera
 
 from ._compressed import compressed_residual
 from ._levenberg_marquardt import DenseDescent, LMOptions, minimize
@@ -98,8 +98,8 @@ def refine_absolute_pose(
     data = (points_world.astype(dtype), measurements.astype(dtype), whitening(sigma_px, (n,), d, dtype), weight, camera)
     start = SE3(cam_from_world.wxyz_xyz.astype(dtype))
     model, iterations, converged = _solve(start, data, loss, options)
-    rows, cost = jax.lax.stop_gradient(_normal_equations(model, data, loss))
-    covariance, regular = symmetric_inverse(rows)
+    hessian, cost = jax.lax.stop_gradient(_normal_equations(model, data, loss))
+    covariance, regular = symmetric_inverse(hessian)
     result = Result.where(converged, Result.success, Result.not_converged)
     result = Result.where(regular, result, Result.degenerate)
     return Refinement(model, jnp.where(regular, covariance, 0.0), cost, iterations, result)
@@ -119,21 +119,22 @@ def _residual(x: Array, y: Array, z: Array, observations: _Observations, camera:
     return robustify(white, loss, observations.weight)
 
 
-def _accumulate(points: Any, observations: _Observations, camera: Any, loss: Loss) -> list[list[Array]]:
-    """Lower triangle of [J r]ᵀ[J r] for a camera-frame perturbation of points that are already in the camera frame."""
+def _accumulate(points: Any, observations: _Observations, camera: Any, loss: Loss) -> Array:
+    """[J r]ᵀ[J r] for a camera-frame perturbation of points that are already in the camera frame."""
     x, y, z = points
     residual, derivative = jax.linearize(lambda *p: _residual(*p, observations, camera, loss), x, y, z)
     one, zero = jnp.ones_like(x), jnp.zeros_like(x)
     by_x, by_y, by_z = derivative(one, zero, zero), derivative(zero, one, zero), derivative(zero, zero, one)
-    sums: list[list[Array]] = [[jnp.zeros((), x.dtype)] * (i + 1) for i in range(7)]
-    for r, a, b, c in zip(residual, by_x, by_y, by_z, strict=True):
-        # X(ξ) = exp(−ξ) X has dX = −ρ + X × φ, so the row by φ is (a, b, c) × X.
-        row = (-a, -b, -c, b * z - c * y, c * x - a * z, a * y - b * x, r)
-        sums = [[sums[i][j] + jnp.sum(row[i] * row[j]) for j in range(i + 1)] for i in range(7)]
-    return sums
+    # X(ξ) = exp(−ξ) X has dX = −ρ + X × φ, so the row by φ is (a, b, c) × X.
+    columns = [
+        (-a, -b, -c, b * z - c * y, c * x - a * z, a * y - b * x, r)
+        for r, a, b, c in zip(residual, by_x, by_y, by_z, strict=True)
+    ]
+    rows = jnp.concatenate([jnp.stack(column) for column in columns], axis=1)
+    return jnp.matmul(rows, rows.T, precision="highest")
 
 
-def _moments(increment: Array, args: Any) -> tuple[list[list[Array]], Any]:
+def _moments(increment: Array, args: Any) -> tuple[Array, Array]:
     observations, camera, loss = args
     matrix = SE3.exp(-increment).as_matrix()
     x, y, z = observations.points
@@ -144,11 +145,11 @@ def _moments(increment: Array, args: Any) -> tuple[list[list[Array]], Any]:
 _pose_residual = compressed_residual(_moments)
 
 
-def _normal_equations(cam_from_world: SE3, data: Any, loss: Loss) -> tuple[list[list[Array]], Array]:
-    """Gauss–Newton matrix (lower triangle) and cost at a pose."""
+def _normal_equations(cam_from_world: SE3, data: Any, loss: Loss) -> tuple[Array, Array]:
+    """Gauss–Newton matrix and cost at a pose."""
     observations, camera = _observe(cam_from_world, data)
     sums = _accumulate(observations.points, observations, camera, loss)
-    return sums[:6], 0.5 * sums[6][6]
+    return sums[:6, :6], 0.5 * sums[6, 6]
 
 
 def _optimise(start: SE3, data: Any, loss: Loss, options: LMOptions) -> tuple[SE3, Array, Array]:
@@ -181,7 +182,7 @@ def _as_candidate(found_data_loss: Any) -> Candidates[SE3]:
 
 
 # The optimum is found beforehand; this gives it its derivative, with the exact Hessian of the cost.
-_with_derivative = implicit(_as_candidate, _gradient, retract_camera, 6)
+_with_derivative = implicit(_as_candidate, _gradient, perturb_camera, 6)
 
 
 def _solve(start: SE3, data: Any, loss: Loss, options: LMOptions) -> tuple[SE3, Array, Array]:

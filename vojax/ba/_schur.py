@@ -57,7 +57,7 @@ def reduce(system: ArrowSystem) -> Reduced:
     """
     dtype = system.camera.dtype
     c, p = system.cross.shape[2:]
-    inverse, _ = symmetric_inverse([[system.landmark[i, j] for j in range(i + 1)] for i in range(3)])
+    inverse, _ = symmetric_inverse(system.landmark)
     eliminated = jnp.sum(system.cross[:, :, None] * inverse[None, :, :, None, :], axis=1)  # W V⁻¹: [6, 3, c, p]
     flat = (2, 0, 3, 1)  # [c, 6, p, 3]
     left = eliminated.transpose(flat).reshape(6 * c, 3 * p)

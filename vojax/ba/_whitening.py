@@ -33,10 +33,10 @@ def whitening(sigma_px: Any, shape: tuple[int, ...], d: int, dtype: Any) -> tupl
             f"sigma_px has shape {sigma.shape}: expected one standard deviation (), one for each observation {shape}, "
             f"or covariances {(*shape, d, d)}"
         )
-    rows, inverse, _ = cholesky_factor([[sigma[..., i, j] for j in range(i + 1)] for i in range(d)])
+    columns, inverse, _ = cholesky_factor(jnp.moveaxis(sigma, (-2, -1), (0, 1)))
     whitened: list[list[Array]] = []  # inverse of the Cholesky factor, by forward substitution
     for i in range(d):
-        row = [-inverse[i] * sum(rows[i][k] * whitened[k][j] for k in range(j, i)) for j in range(i)]
+        row = [-inverse[i] * sum(columns[k][i - k] * whitened[k][j] for k in range(j, i)) for j in range(i)]
         whitened.append([*row, inverse[i]])
     return tuple(entry for row in whitened for entry in row)
 

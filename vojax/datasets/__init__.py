@@ -1,9 +1,9 @@
 from ._kitti import KittiSequence as KittiSequence
+from ._motion import motion_profile as motion_profile
 from ._simulator import AbsolutePoseProblem as AbsolutePoseProblem
 from ._simulator import RelativePoseProblem as RelativePoseProblem
 from ._simulator import RigidProblem as RigidProblem
 from ._simulator import StereoWindow as StereoWindow
-from ._simulator import motion_profile as motion_profile
 from ._simulator import simulate_absolute_pose as simulate_absolute_pose
 from ._simulator import simulate_relative_pose as simulate_relative_pose
 from ._simulator import simulate_rigid as simulate_rigid

@@ -15,9 +15,9 @@ _SUFFIXES = (".png", ".jpg", ".jpeg")
 class KittiSequence:
     """One sequence of the KITTI odometry benchmark; images are read when asked for.
 
-    The layout is `sequences/<name>/` with `calib.txt` (rows `P0:` and `P1:` of 12 numbers), `times.txt`, `image_0` (left)
-    and `image_1` (right), and `poses/<name>.txt` where the true trajectory is known. Everything but the images is read and
-    checked at once.
+    The layout is `sequences/<name>/` with `calib.txt` (rows `P0:` and `P1:` of 12 numbers), `times.txt`, `image_0`
+    (left) and `image_1` (right), and `poses/<name>.txt` where the true trajectory is known. Everything but the images
+    is read and checked at once.
 
     Args:
         root: The folder that holds `sequences` and, if there is a ground truth, `poses`.
@@ -91,7 +91,7 @@ class KittiSequence:
         right = read_image(self._right[k])
         if left.shape != right.shape:
             raise ValueError(
-                f"{self._left[k]} has shape {left.shape} and {self._right[k]} {right.shape}: expected images of one size"
+                f"{self._left[k]} has shape {left.shape} and {self._right[k]} {right.shape}: expected one size"
             )
         return left, right
 
@@ -121,8 +121,8 @@ def _image_files(folder: pathlib.Path) -> list[pathlib.Path]:
 def _check_pairs(folder: pathlib.Path, left: list[pathlib.Path], right: list[pathlib.Path]) -> None:
     if len(left) != len(right):
         raise ValueError(
-            f"{folder} has {len(left)} images in image_0 and {len(right)} in image_1: expected one right image for each "
-            "left one; copy the missing files"
+            f"{folder} has {len(left)} images in image_0 and {len(right)} in image_1: expected one right image for "
+            "each left one; copy the missing files"
         )
     for one, other in zip(left, right, strict=True):
         if one.stem != other.stem:
@@ -164,7 +164,9 @@ def _calibration(path: pathlib.Path, stereo: bool) -> tuple[Pinhole, RectifiedSt
     p0 = rows["P0"]
     fx, fy, cx, cy, skew = p0[0, 0], p0[1, 1], p0[0, 2], p0[1, 2], p0[0, 1]
     if fx <= 0 or fy <= 0 or not np.allclose(p0[2, :3], (0, 0, 1)) or not np.allclose(p0[1, 0], 0):
-        raise ValueError(f"{path}, row P0, is not a projection K [I | t] with positive focal lengths: got {p0.tolist()}")
+        raise ValueError(
+            f"{path}, row P0, is not a projection K [I | t] with positive focal lengths: got {p0.tolist()}"
+        )
     camera = Pinhole(fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy), skew=float(skew))
     if not stereo:
         return camera, None

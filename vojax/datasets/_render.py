@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from vojax._types import Array
+from vojax._types import Array, ArrayLike
 
 from . import _texture as texture
 
@@ -45,15 +45,15 @@ class View(NamedTuple):
         light: Gain on all radiance, and contrast of all texture.
     """
 
-    rotation: Array
-    intrinsics: Array
-    boxes: Array
-    materials: Array
-    ground: Array
-    lane: Array
-    lane_origin: Array
-    sun: Array
-    light: Array
+    rotation: ArrayLike
+    intrinsics: ArrayLike
+    boxes: ArrayLike
+    materials: ArrayLike
+    ground: ArrayLike
+    lane: ArrayLike
+    lane_origin: ArrayLike
+    sun: ArrayLike
+    light: ArrayLike
 
 
 def _directions(view: View, u: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -113,14 +113,16 @@ def _nearest(view: View, directions: tuple[Array, Array, Array]) -> Array:
     return jnp.where(best == _NO_HIT, SKY, best & mask)
 
 
+def _column(table: ArrayLike, j: int, row: Array) -> Array:
+    return jnp.asarray(table)[:, j].at[row].get(mode="promise_in_bounds")
+
+
 def _hit(view: View, directions: tuple[Array, Array, Array], code: Array) -> tuple[Array, tuple[Array, ...]]:
     """Exact depth on the plane of the coded face, and the box's parameters per ray."""
     dx, dy, dz = directions
     number = code & 63
     row = jnp.minimum(number, MAX_BOXES - 1)
-    box = lax.optimization_barrier(
-        tuple(view.boxes[:, j].at[row].get(mode="promise_in_bounds") for j in range(8))
-    )
+    box = lax.optimization_barrier(tuple(_column(view.boxes, j, row) for j in range(8)))
     dy_inverse = 1.0 / _nonzero(dy)
     (ex, ey, ez), _ = _slabs(box, dx, dy_inverse, dz)
     t = jnp.where(code >= 128, ey, jnp.where(code >= 64, ex, ez))
@@ -169,8 +171,8 @@ def render_image(view: View, key: Array, noise: Array, *, width: int, height: in
     directions = _directions(view, u, v)
     offsets = [(i + 0.5) / supersample - 0.5 for i in range(supersample)]
     samples = [(a, b) for b in offsets for a in offsets if supersample > 1]
-    stacked = tuple(jnp.stack([d, *(_shifted(d, a, b, view, i) for a, b in samples)]) for i, d in enumerate(directions))
-    codes = lax.optimization_barrier(_nearest(view, stacked))
+    x, y, z = (jnp.stack([d, *(_shifted(d, a, b, view, i) for a, b in samples)]) for i, d in enumerate(directions))
+    codes = lax.optimization_barrier(_nearest(view, (x, y, z)))
     radiance = lax.optimization_barrier(_shade(view, directions, codes[0]))
     if samples:
         radiance = _blend_outlines(radiance, codes[0], codes[1:], samples)
@@ -233,9 +235,7 @@ def _shade(view: View, directions: tuple[Array, Array, Array], code: Array) -> A
     facing = jnp.maximum(jnp.where(is_flat, -sy, facing), 0.0)
 
     row = jnp.minimum(code & 63, MAX_BOXES - 1)
-    material = texture.Material(
-        *(view.materials[:, j].at[row].get(mode="promise_in_bounds") for j in range(len(texture.Material._fields)))
-    )
+    material = texture.Material(*(_column(view.materials, j, row) for j in range(len(texture.Material._fields))))
     away = jnp.where(jnp.where(is_x, lx, lz) > 0, 2, 0)
     seed = jnp.where(is_ground, 977, material.seed.astype(jnp.int32) * 8 + (code >> 6) + away).astype(jnp.uint32)
     texture_u = jnp.where(is_ground, ground_x, jnp.where(is_lid, bx, u))
@@ -249,7 +249,9 @@ def _shade(view: View, directions: tuple[Array, Array, Array], code: Array) -> A
     grain = lax.optimization_barrier(texture.grain(texture_u, texture_v, seed, slant))
     wall = texture.wall(material, u, v, 2.0 * length, bottom - top, seed, grain, slant, across)
     wall = jnp.where(is_lid, 0.8 * material.albedo * (1.0 + 0.5 * grain), wall)
-    lateral, along, heading = texture.lane_coordinates(view.lane, view.lane_origin, ground_x, ground_z)
+    lateral, along, heading = texture.lane_coordinates(
+        jnp.asarray(view.lane), jnp.asarray(view.lane_origin), ground_x, ground_z
+    )
     floor = texture.street(lateral, along, heading, dx / horizontal, dz / horizontal, across, slant)
     shadow, wall, floor = lax.optimization_barrier((shadow, wall, floor))
 

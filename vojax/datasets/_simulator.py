@@ -1,18 +1,20 @@
 """Seeded problems with known answers: correspondences, stereo windows and the motion of a virtual robot."""
 
 import functools
-from typing import Any, Literal, NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from vojax._types import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from vojax._types import Array, Bool, Float, PRNGKeyArray
 from vojax.cameras import Pinhole, RectifiedStereo
 from vojax.lie import SE3, SO3
 
-Motion = Literal["forward", "turning", "sideways", "random"]
+from ._motion import Motion, Scalar, float_dtype, motion_profile
+
 ImageSize = tuple[int, int]
-Scalar = float | ArrayLike
 
 # One compilation each: run operation by operation they take seconds on the first call.
 _static = ("image_size", "depth_range", "outlier_fraction", "dtype")
@@ -61,9 +63,9 @@ class RigidProblem(NamedTuple):
 
     Attributes:
         points0: Points in frame 0, free of noise.
-        points1: Measured points in frame 1, `cam1_from_cam0 @ points0` (times `scale`, about the origin of frame 1) plus noise.
+        points1: Measured points in frame 1, with noise.
         cam1_from_cam0: True rigid motion.
-        scale: Factor between the frames: `points1 = scale * R @ points0 + t` (1 for a rigid problem).
+        scale: Factor between the frames, 1 for a rigid motion: `points1 = scale * R @ points0 + t`.
         inliers: False for the points that were replaced by outliers.
     """
 
@@ -92,70 +94,6 @@ class StereoWindow(NamedTuple):
     stereo: RectifiedStereo
     world_from_cam: SE3
     landmarks_world: Float[Array, "*batch p 3"]
-
-
-@functools.partial(jax.jit, static_argnames=("frames", "motion", "dtype"))
-def motion_profile(
-    frames: int,
-    *,
-    key: PRNGKeyArray,
-    motion: Motion = "turning",
-    step: Scalar = 1.0,
-    dtype: Any = None,
-) -> SE3:
-    """Drive a virtual robot for a number of frames.
-
-    The motion is made of velocities in the camera's own frame (+z forward, +y down), so consecutive poses differ by
-    about `step` whatever the path looks like from above.
-
-    Args:
-        frames: Number of poses, at least 1.
-        key: Fixes the phase of the wobble, and the whole path of `"random"`.
-        motion: `"forward"` (straight on, with a gentle sway and heave), `"turning"` (the same with bends of up to 4° a
-            frame), `"sideways"` (along +x) or `"random"` (independent steps in all six degrees of freedom).
-        step: Distance between consecutive positions, metres.
-        dtype: Floating type; JAX's default where it is None.
-
-    Returns:
-        Poses `world_from_cam` with a leading frame axis; the first is the identity.
-
-    Raises:
-        ValueError: fewer than one frame, or a motion of another name.
-
-    Example:
-        >>> import jax
-        >>> motion_profile(5, key=jax.random.key(0)).wxyz_xyz.shape
-        (5, 7)
-    """
-    if frames < 1:
-        raise ValueError(f"frames is {frames}; a path needs at least 1")
-    if motion not in ("forward", "turning", "sideways", "random"):
-        raise ValueError(f"motion is {motion!r}; expected 'forward', 'turning', 'sideways' or 'random'")
-    dtype = _float_dtype(dtype)
-    phase_key, step_key = jax.random.split(key)
-    if motion == "random":
-        velocity = jax.random.normal(step_key, (frames - 1, 6), dtype)
-        velocity = velocity * _columns([0.58 * step] * 3 + [0.05] * 3, dtype)
-    else:
-        phase = 2 * jnp.pi * jax.random.uniform(phase_key, (1, 6), dtype)
-        period = jnp.array([[9.0, 7.0, 23.0, 11.0, 17.0, 13.0]], dtype)
-        angle = 2 * jnp.pi * jnp.arange(frames - 1, dtype=dtype)[:, None] / period + phase
-        amplitude = _columns([0.02 * step, 0.02 * step, 0.1 * step, 0.004, 0.004, 0.004], dtype)
-        velocity = amplitude * jnp.sin(angle)
-        along = 0 if motion == "sideways" else 2
-        velocity = velocity.at[:, along].add(step)
-        if motion == "turning":
-            # Squared, so that straight stretches lie between the bends; the sign alternates.
-            bend = jnp.sin(2 * jnp.pi * jnp.arange(frames - 1, dtype=dtype) / 60 + phase[0, 4])
-            velocity = velocity.at[:, 4].add(0.07 * bend * jnp.abs(bend))
-
-    def move(pose: SE3, tangent: Array) -> tuple[SE3, SE3]:
-        pose = (pose @ SE3.exp(tangent)).normalize()
-        return pose, pose
-
-    first = SE3.identity(dtype=dtype)
-    _, later = jax.lax.scan(move, first, velocity)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
 
 
 @functools.partial(jax.jit, static_argnames=("n", *_static))
@@ -192,15 +130,15 @@ def simulate_absolute_pose(
         >>> int(problem.inliers.sum())
         8
     """
-    dtype = _float_dtype(dtype)
+    dtype = float_dtype(dtype)
     camera = _default_camera(image_size, dtype) if camera is None else camera
-    keys = jax.random.split(key, 6)
-    cam_from_world = _random_pose(keys[0], 10.0, dtype)
-    true_pixels = _uniform_pixels(keys[1], n, image_size, dtype)
-    points_cam = camera.unproject(true_pixels) * _uniform_depths(keys[2], n, depth_range, dtype)[:, None]
-    inliers = _inlier_mask(keys[3], n, outlier_fraction)
-    noisy = true_pixels + sigma_px * jax.random.normal(keys[4], (n, 2), dtype)
-    pixels = jnp.where(inliers[:, None], noisy, _uniform_pixels(keys[5], n, image_size, dtype))
+    few, draw = _draws(key, n, 7, dtype)
+    cam_from_world = _random_pose(few, 10.0)
+    true_pixels = _pixels(draw[:, 0:2], image_size)
+    points_cam = camera.unproject(true_pixels) * _between(draw[:, 2], depth_range)[:, None]
+    inliers = _inlier_mask(few[6], n, outlier_fraction)
+    noisy = true_pixels + sigma_px * _normal(draw[:, 3:5])
+    pixels = jnp.where(inliers[:, None], noisy, _pixels(draw[:, 5:7], image_size))
     points_world = cam_from_world.inverse().apply(points_cam)
     return AbsolutePoseProblem(points_world, pixels, camera, cam_from_world, inliers)
 
@@ -234,20 +172,18 @@ def simulate_relative_pose(
     Returns:
         The problem with its truth; the baseline has length 1 and any direction.
     """
-    dtype = _float_dtype(dtype)
+    dtype = float_dtype(dtype)
     camera = _default_camera(image_size, dtype) if camera is None else camera
-    keys = jax.random.split(key, 9)
-    axis = _unit(jax.random.normal(keys[0], (3,), dtype))
-    angle = max_angle * jax.random.uniform(keys[1], (), dtype)
-    direction = _unit(jax.random.normal(keys[2], (3,), dtype))
-    cam1_from_cam0 = SE3.from_rotation_and_translation(SO3.exp(axis * angle), direction)
-    true0 = _uniform_pixels(keys[3], n, image_size, dtype)
-    points_cam0 = camera.unproject(true0) * _uniform_depths(keys[4], n, depth_range, dtype)[:, None]
+    few, draw = _draws(key, n, 9, dtype)
+    rotation = SO3.exp(_direction(few[0:2]) * (max_angle * few[2]))
+    cam1_from_cam0 = SE3.from_rotation_and_translation(rotation, _direction(few[3:5]))
+    true0 = _pixels(draw[:, 0:2], image_size)
+    points_cam0 = camera.unproject(true0) * _between(draw[:, 2], depth_range)[:, None]
     true1 = camera.project(cam1_from_cam0.apply(points_cam0))
-    inliers = _inlier_mask(keys[5], n, outlier_fraction)
-    pixels0 = true0 + sigma_px * jax.random.normal(keys[6], (n, 2), dtype)
-    noisy1 = true1 + sigma_px * jax.random.normal(keys[7], (n, 2), dtype)
-    pixels1 = jnp.where(inliers[:, None], noisy1, _uniform_pixels(keys[8], n, image_size, dtype))
+    inliers = _inlier_mask(few[6], n, outlier_fraction)
+    pixels0 = true0 + sigma_px * _normal(draw[:, 3:5])
+    noisy1 = true1 + sigma_px * _normal(draw[:, 5:7])
+    pixels1 = jnp.where(inliers[:, None], noisy1, _pixels(draw[:, 7:9], image_size))
     return RelativePoseProblem(pixels0, pixels1, camera, cam1_from_cam0, points_cam0, inliers)
 
 
@@ -276,18 +212,17 @@ def simulate_rigid(
     Returns:
         The problem with its truth, `points1 = scale * R @ points0 + t` on the inliers up to noise.
     """
-    dtype = _float_dtype(dtype)
-    keys = jax.random.split(key, 5)
-    cam1_from_cam0 = _random_pose(keys[0], extent, dtype)
+    dtype = float_dtype(dtype)
+    few, draw = _draws(key, n, 9, dtype)
+    cam1_from_cam0 = _random_pose(few, extent)
 
     def move(points: Array) -> Array:
-        return scale * cam1_from_cam0.rotation().apply(points) + cam1_from_cam0.translation()[None]
+        return jnp.asarray(scale) * cam1_from_cam0.rotation().apply(points) + cam1_from_cam0.translation()[None]
 
-    points0 = jax.random.uniform(keys[1], (n, 3), dtype, -extent, extent)
-    elsewhere = jax.random.uniform(keys[2], (n, 3), dtype, -extent, extent)
-    inliers = _inlier_mask(keys[3], n, outlier_fraction)
-    noisy = move(points0) + sigma * jax.random.normal(keys[4], (n, 3), dtype)
-    points1 = jnp.where(inliers[:, None], noisy, move(elsewhere))
+    points0 = _between(draw[:, 0:3], (-extent, extent))
+    inliers = _inlier_mask(few[6], n, outlier_fraction)
+    noisy = move(points0) + sigma * _normal(draw[:, 3:6])
+    points1 = jnp.where(inliers[:, None], noisy, move(_between(draw[:, 6:9], (-extent, extent))))
     return RigidProblem(points0, points1, cam1_from_cam0, jnp.asarray(scale, dtype), inliers)
 
 
@@ -332,18 +267,17 @@ def simulate_stereo_window(
         >>> window.observations.shape
         (4, 30, 3)
     """
-    dtype = _float_dtype(dtype)
+    dtype = float_dtype(dtype)
     if stereo is None:
         stereo = RectifiedStereo(_default_camera(image_size, dtype, focal=400.0), jnp.asarray(0.54, dtype))
-    keys = jax.random.split(key, 8)
-    world_from_cam = motion_profile(frames, key=keys[0], motion=motion, step=step, dtype=dtype)
-    seen_from = jax.random.randint(keys[1], (landmarks,), 0, frames)
+    world_from_cam = motion_profile(frames, key=key, motion=motion, step=step, dtype=dtype)
+    _, draw = _draws(jax.random.fold_in(key, 1), landmarks, 4 + 7 * frames, dtype)
+    seen_from = jnp.minimum((draw[:, 0] * frames).astype(jnp.int32), frames - 1)
     width, height = image_size
-    depths = _uniform_depths(keys[3], landmarks, depth_range, dtype)
+    depths = _between(draw[:, 1], depth_range)
     # Left of its disparity a pixel has no partner in the right image.
     disparity = stereo.camera.fx * stereo.baseline / depths
-    share = jax.random.uniform(keys[2], (landmarks, 2), dtype)
-    pixels = jnp.stack([disparity + share[:, 0] * (width - 1 - disparity), share[:, 1] * (height - 1)], axis=-1)
+    pixels = jnp.stack([disparity + draw[:, 2] * (width - 1 - disparity), draw[:, 3] * (height - 1)], axis=-1)
     bearings = stereo.camera.unproject(pixels)
     points_cam = bearings / bearings[:, 2:] * depths[:, None]
     anchor = jax.tree.map(lambda leaf: leaf[seen_from], world_from_cam)
@@ -355,21 +289,14 @@ def simulate_stereo_window(
     u_left, v, u_right, z = true[..., 0], true[..., 1], true[..., 2], points[..., 2]
     visible = (z >= 0.99 * depth_range[0]) & (z <= 1.01 * depth_range[1]) & (v >= 0) & (v <= height - 1)
     visible = visible & (u_left >= 0) & (u_left <= width - 1) & (u_right >= 0) & (u_right <= width - 1)
-    noisy = true + sigma_px * jax.random.normal(keys[4], true.shape, dtype)
-    high = jnp.array([width - 1, height - 1, width - 1], dtype)
-    wrong = jax.random.uniform(keys[5], true.shape, dtype) * high[None, None]
-    replaced = jax.random.uniform(keys[6], visible.shape, dtype) < outlier_fraction
+    draw = jnp.moveaxis(draw[:, 4:].reshape(landmarks, frames, 7), 0, 1)
+    noisy = true + sigma_px * _normal(draw[..., 0:3])
+    wrong = draw[..., 3:6] * jnp.array([width - 1, height - 1, width - 1], dtype)[None, None]
+    _check_share(outlier_fraction)
+    replaced = draw[..., 6] < outlier_fraction
     observations = jnp.where(replaced[..., None], wrong, noisy)
     observations = jnp.where(visible[..., None], observations, 0.0)
     return StereoWindow(observations, visible, visible & ~replaced, stereo, world_from_cam, landmarks_world)
-
-
-def _columns(values: list, dtype: Any) -> Array:
-    return jnp.stack([jnp.asarray(value, dtype) for value in values])[None]
-
-
-def _float_dtype(dtype: Any) -> Any:
-    return jnp.zeros(()).dtype if dtype is None else jnp.dtype(dtype)
 
 
 def _default_camera(image_size: ImageSize, dtype: Any, focal: float = 800.0) -> Pinhole:
@@ -378,28 +305,52 @@ def _default_camera(image_size: ImageSize, dtype: Any, focal: float = 800.0) -> 
     return Pinhole(fx=fx, fy=fx, cx=cx, cy=cy)
 
 
-def _random_pose(key: PRNGKeyArray, extent: float, dtype: Any) -> SE3:
-    """Uniform rotation, and a position of the frame's origin uniform in a cube."""
-    rotation_key, position_key = jax.random.split(key)
-    rotation = SO3.exp(SO3.sample_uniform(rotation_key).log().astype(dtype))
-    position = jax.random.uniform(position_key, (3,), dtype, -extent, extent)
+def _draws(key: PRNGKeyArray, n: int, columns: int, dtype: Any) -> tuple[Array, Array]:
+    """Seven uniform numbers for the problem and a row for each of `n` items: one draw, as each is slow to compile."""
+    draw = jax.random.uniform(key, (7 + n * columns,), dtype)
+    return draw[:7], draw[7:].reshape(n, columns)
+
+
+def _between(share: Array, limits: tuple[float, float]) -> Array:
+    return limits[0] + (limits[1] - limits[0]) * share
+
+
+def _pixels(share: Array, image_size: ImageSize) -> Array:
+    return share * jnp.array([image_size[0] - 1, image_size[1] - 1], share.dtype)[None]
+
+
+def _normal(share: Array) -> Array:
+    limit = 1 - float(jnp.finfo(share.dtype).eps)
+    return 2**0.5 * jax.scipy.special.erfinv(jnp.clip(2 * share - 1, -limit, limit))
+
+
+def _direction(share: Array) -> Array:
+    """Uniform on the sphere, from two numbers."""
+    z, azimuth = 2 * share[0] - 1, 2 * jnp.pi * share[1]
+    radius = jnp.sqrt(jnp.maximum(1 - z * z, 0.0))
+    return jnp.stack([radius * jnp.cos(azimuth), radius * jnp.sin(azimuth), z])
+
+
+def _random_pose(share: Array, extent: float) -> SE3:
+    """Uniform rotation (Shoemake 1992), and a position of the frame's origin uniform in a cube, from six numbers."""
+    a, b = 2 * jnp.pi * share[1], 2 * jnp.pi * share[2]
+    low, high = jnp.sqrt(1 - share[0]), jnp.sqrt(share[0])
+    rotation = SO3(jnp.stack([low * jnp.sin(a), low * jnp.cos(a), high * jnp.sin(b), high * jnp.cos(b)]))
+    position = _between(share[3:6], (-extent, extent))
     return SE3.from_rotation_and_translation(rotation, -rotation.apply(position))
 
 
-def _uniform_pixels(key: PRNGKeyArray, n: int, image_size: ImageSize, dtype: Any) -> Array:
-    high = jnp.array([image_size[0] - 1, image_size[1] - 1], dtype)
-    return jax.random.uniform(key, (n, 2), dtype) * high[None]
-
-
-def _uniform_depths(key: PRNGKeyArray, n: int, depth_range: tuple[float, float], dtype: Any) -> Array:
-    return jax.random.uniform(key, (n,), dtype, depth_range[0], depth_range[1])
-
-
-def _inlier_mask(key: PRNGKeyArray, n: int, outlier_fraction: float) -> Array:
+def _check_share(outlier_fraction: float) -> None:
     if not 0 <= outlier_fraction <= 1:
         raise ValueError(f"outlier_fraction is {outlier_fraction}; expected a share between 0 and 1")
-    return jax.random.permutation(key, jnp.arange(n) >= round(outlier_fraction * n))
 
 
-def _unit(vector: Array) -> Array:
-    return vector / jnp.linalg.norm(vector)
+def _inlier_mask(share: Array, n: int, outlier_fraction: float) -> Array:
+    """An exact number of outliers, scattered over the indices: golden-ratio steps from a random start (no sort)."""
+    _check_share(outlier_fraction)
+    stride = max(round(0.618 * n), 1)
+    while math.gcd(stride, n) != 1:
+        stride += 1
+    start = (share * n).astype(jnp.int32)
+    place = (jnp.asarray(np.arange(n) * stride % max(n, 1), jnp.int32) + start) % n
+    return place >= round(outlier_fraction * n)

@@ -134,8 +134,8 @@ class _Builder:
                 return False
         return True
 
-    def add(self, x, z, yaw, half_x, half_z, top, bottom, material) -> None:
-        self.geometry.append((x, z, yaw, half_x, half_z, top, bottom))
+    def add(self, geometry: tuple[float, ...], material: tuple[float, ...]) -> None:
+        self.geometry.append(geometry)
         albedo, *rest = material
         self.materials.append((albedo, float(len(self.materials) + 1), *rest))
 
@@ -175,7 +175,7 @@ def _houses(builder: _Builder, side: float, offset: float, end: float) -> None:
             # Box x runs along the street.
             yaw = heading - np.pi / 2
             if builder.clear(x, z, yaw, half_length, half_depth, 4.2 if side > 0 else 5.4):
-                builder.add(x, z, yaw, half_length, half_depth, GROUND_Y - height, GROUND_Y, material)
+                builder.add((x, z, yaw, half_length, half_depth, GROUND_Y - height, GROUND_Y), material)
                 break
         s += 2 * half_length + rng.choice([0.0, 0.0, 0.3, 2.2])
 
@@ -189,10 +189,10 @@ def _backdrop(builder: _Builder, end: float) -> None:
             half, height = rng.uniform(5, 8), rng.uniform(13, 19)
             yaw = heading - np.pi / 2 + rng.uniform(-0.3, 0.3)
             if builder.clear(x, z, yaw, half, half, 12.0):
-                builder.add(x, z, yaw, half, half, GROUND_Y - height, GROUND_Y, house_material(rng))
+                builder.add((x, z, yaw, half, half, GROUND_Y - height, GROUND_Y), house_material(rng))
     x, z, heading = builder.path.place(end)
     x, z = x + 9 * np.sin(heading), z + 9 * np.cos(heading)
-    builder.add(x, z, heading, 17.0, 5.0, GROUND_Y - 11.5, GROUND_Y, house_material(rng))
+    builder.add((x, z, heading, 17.0, 5.0, GROUND_Y - 11.5, GROUND_Y), house_material(rng))
 
 
 def car_boxes(x: float, z: float, heading: float, rng: np.random.Generator) -> list[tuple]:
@@ -217,7 +217,7 @@ def _cars(builder: _Builder, side: float, lateral: float, end: float) -> None:
         x, z, heading = builder.path.place(s, side * lateral)
         if builder.clear(x, z, heading - np.pi / 2, 2.2, 0.9, 1.5):
             for geometry, material in car_boxes(x, z, heading, rng):
-                builder.add(*geometry, material)
+                builder.add(geometry, material)
         s += rng.choice([6.0, 12.0, 19.0]) + rng.uniform(0, 2)
 
 
@@ -227,13 +227,13 @@ def _furniture(builder: _Builder, side: float, lateral: float, end: float) -> No
     for s in np.arange(rng.uniform(3, 9), end, 14.0):
         x, z, heading = builder.path.place(s, side * lateral)
         if builder.clear(x, z, 0.0, 0.1, 0.1, 2.0):
-            builder.add(x, z, heading, 0.08, 0.08, GROUND_Y - 5.2, GROUND_Y, (0.2, 0.5, 0.9, 9.0, 9.0, 0.0, 0.0))
+            builder.add((x, z, heading, 0.08, 0.08, GROUND_Y - 5.2, GROUND_Y), (0.2, 0.5, 0.9, 9.0, 9.0, 0.0, 0.0))
         x, z, heading = builder.path.place(s + rng.uniform(4, 9), side * (lateral + rng.uniform(0.5, 1.0)))
         half, height = rng.uniform(0.25, 0.55), rng.uniform(0.7, 1.9)
         if builder.clear(x, z, 0.0, 0.7, 0.7, 2.0):
             material = (rng.uniform(0.25, 0.65), 0.9, rng.uniform(0.15, 0.3), 9.0, 9.0, 0.0, 0.0)
             yaw = heading + rng.uniform(-0.4, 0.4)
-            builder.add(x, z, yaw, half, half, GROUND_Y - height, GROUND_Y, material)
+            builder.add((x, z, yaw, half, half, GROUND_Y - height, GROUND_Y), material)
 
 
 def lane_grid(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -244,7 +244,9 @@ def lane_grid(path: Path) -> tuple[np.ndarray, np.ndarray]:
     x, z = x + (distance - inside) * np.sin(heading), z + (distance - inside) * np.cos(heading)
     reach = int(14 / GRID_STEP)
     corner = np.array([x.min(), z.min()]) - (reach + 1) * GRID_STEP
-    shape = tuple(int(np.ceil((values.max() - low) / GRID_STEP)) + reach + 2 for values, low in ((z, corner[1]), (x, corner[0])))
+    shape = tuple(
+        int(np.ceil((values.max() - low) / GRID_STEP)) + reach + 2 for values, low in ((z, corner[1]), (x, corner[0]))
+    )
     nearest = np.full(shape, np.inf)
     lateral, along = np.full(shape, _OFF_LANE), np.zeros(shape)
     window = np.arange(-reach, reach + 1)

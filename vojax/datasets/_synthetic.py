@@ -14,7 +14,7 @@ _KEPT_FRAMES = 128
 
 
 class SyntheticStereoSequence:
-    """A stereo camera on a car: a straight, a bend of 70 to 85 degrees and a straight, at 10 Hz and about 0.9 m a frame.
+    """A stereo camera on a car: a straight, a bend of 70 to 85 degrees, a straight; 10 Hz, about 0.9 m a frame.
 
     It reads like a KITTI sequence. The pictures are made when asked for (on the device that JAX uses) and the last 128
     frames are kept. The same arguments give the same pictures; sequences of different lengths share their first frames.

@@ -250,5 +250,3 @@ def sky(dx: Array, dy: Array, dz: Array, horizontal: Array) -> Array:
     seed = jnp.full(x.shape, 4242, jnp.uint32)
     cloud = value_noise(1.1 * x, 1.1 * z, seed) + 0.5 * value_noise(2.7 * x, 2.7 * z, seed + jnp.uint32(1))
     return 0.92 - 0.35 * jnp.clip(elevation, 0.0, 1.0) + 0.10 * cloud
-
-

@@ -24,17 +24,18 @@ class DetectorOptions:
         min_quality: Weakest response kept: for "gftt" the square root of the smaller eigenvalue, roughly the r.m.s.
             gradient across the weaker direction in grey levels per pixel; for "fast" the segment-test threshold in
             grey levels.
-        subpixel: Refine to sub-pixel corners.
+        subpixel: Refine to sub-pixel corners, by at most half a block. Off because tracking and stereo matching
+            need no corners and are as accurate around whole pixels (measured on KITTI 06).
     """
 
     detector: Literal["gftt", "fast"] = "gftt"
-    max_features: int = 800
+    max_features: int = 600
     cell_px: int = 64
     min_distance_px: int = 7
     border_px: int = 8
     block_px: int = 5
     min_quality: float = 2.0
-    subpixel: bool = True
+    subpixel: bool = False
 
     def __post_init__(self) -> None:
         if self.detector not in ("gftt", "fast"):
@@ -90,7 +91,7 @@ def detect(
     pixels = np.stack([cols, rows], axis=-1).astype(np.float32)
     quality = response.ravel()[chosen]
     if options.subpixel and len(pixels):
-        pixels = _subpixel(gray, pixels)
+        pixels = _subpixel(gray, pixels, options.block_px)
     return Keypoints(pixels, quality)
 
 
@@ -149,9 +150,10 @@ def _spread(candidates: np.ndarray, response: np.ndarray, taken: np.ndarray, opt
     return chosen[np.argsort(-response.ravel()[chosen], kind="stable")]
 
 
-def _subpixel(gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def _subpixel(gray: np.ndarray, pixels: np.ndarray, block_px: int) -> np.ndarray:
     """Corners where gradients point away from a common centre; those that run off stay where they were."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
     refined = cv2.cornerSubPix(gray, pixels.reshape(-1, 1, 2).copy(), (3, 3), (-1, -1), criteria).reshape(-1, 2)
-    kept = np.all(np.abs(refined - pixels) <= 1.0, axis=1, keepdims=True)
+    # The response of a perfect corner is a plateau: its peak is up to half a block away.
+    kept = np.all(np.abs(refined - pixels) <= (block_px + 1) / 2, axis=1, keepdims=True)
     return np.where(kept, refined, pixels).astype(np.float32)

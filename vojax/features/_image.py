@@ -15,8 +15,8 @@ _READ_AGAIN = "copy or download the file again"
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     """Read an image file as it is stored.
 
-    Decoders return a half-grey picture for a truncated JPEG and print to stderr for a truncated PNG, so the structure of
-    both formats is checked before decoding.
+    Decoders return a half-grey picture for a truncated JPEG and print to stderr for a truncated PNG, so the structure
+    of both formats is checked before decoding.
 
     Args:
         path: A file in any format OpenCV decodes (PNG, JPEG, PGM, TIFF, …).
@@ -35,7 +35,9 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     except FileNotFoundError:
         raise FileNotFoundError(f"image {path} not found: check the path") from None
     except OSError as error:
-        raise ValueError(f"image {path} cannot be read ({error.strerror}): check the path and its permissions") from None
+        raise ValueError(
+            f"image {path} cannot be read ({error.strerror}): check the path and its permissions"
+        ) from None
     if not data:
         raise ValueError(f"image {path} is empty: {_READ_AGAIN}")
     damage = _damage(data)
@@ -46,7 +48,9 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise ValueError(f"image {path} cannot be decoded ({len(data)} bytes): expected a whole PNG, JPEG, PGM or TIFF file")
+        raise ValueError(
+            f"image {path} cannot be decoded ({len(data)} bytes): expected a whole PNG, JPEG, PGM or TIFF file"
+        )
     if image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"image {path} holds {image.dtype} values: expected 8-bit or 16-bit unsigned integers")
     if image.ndim == 3 and image.shape[2] == 1:
@@ -83,7 +87,9 @@ def to_gray(image: np.ndarray) -> UInt8[np.ndarray, "h w"]:
 def _check_image(image: np.ndarray, name: str) -> None:
     shape_ok = image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (3, 4))
     if not shape_ok or image.size == 0:
-        raise ValueError(f"{name} has shape {image.shape}: expected [height, width] or [height, width, 3 or 4], not empty")
+        raise ValueError(
+            f"{name} has shape {image.shape}: expected [height, width] or [height, width, 3 or 4], not empty"
+        )
     if image.dtype != np.uint8:
         raise ValueError(f"{name} has dtype {image.dtype}: expected uint8 (scale 16-bit images to 8 bits first)")
 
@@ -94,8 +100,8 @@ def gray_pair(image0: np.ndarray, image1: np.ndarray, names: tuple[str, str]) ->
     _check_image(image1, names[1])
     if image0.shape[:2] != image1.shape[:2]:
         raise ValueError(
-            f"{names[0]} has size {image0.shape[1]}×{image0.shape[0]} and {names[1]} {image1.shape[1]}×{image1.shape[0]}: "
-            "expected images of one size"
+            f"{names[0]} has size {image0.shape[1]}×{image0.shape[0]} and "
+            f"{names[1]} {image1.shape[1]}×{image1.shape[0]}: expected images of one size"
         )
     return to_gray(image0), to_gray(image1)
 
@@ -114,9 +120,7 @@ def inside(pixels: np.ndarray, shape: tuple[int, ...], border_px: float | int = 
     """True for finite positions at least `border_px` away from the outermost pixel centres."""
     u, v = pixels[:, 0], pixels[:, 1]
     # Comparisons with NaN are False, so positions that are not finite fall out too.
-    return (
-        (u >= border_px) & (u <= shape[1] - 1 - border_px) & (v >= border_px) & (v <= shape[0] - 1 - border_px)
-    )
+    return (u >= border_px) & (u <= shape[1] - 1 - border_px) & (v >= border_px) & (v <= shape[0] - 1 - border_px)
 
 
 def _damage(data: bytes) -> str | None:

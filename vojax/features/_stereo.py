@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from ._image import check_pixels, gray_pair, inside
-from ._patches import pad, sample_rows, shift_columns, shift_rows, windows
+from ._patches import pad, sample_rows, shift_columns, shift_rows, spline_coefficients, windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,8 @@ class StereoOptions:
     def __post_init__(self) -> None:
         if not self.min_disparity_px < self.max_disparity_px:
             raise ValueError(
-                f"min_disparity_px is {self.min_disparity_px} and max_disparity_px {self.max_disparity_px}: expected min < max"
+                f"min_disparity_px is {self.min_disparity_px} and max_disparity_px {self.max_disparity_px}: "
+                "expected min < max"
             )
         if self.radius_px < 1 or self.coarse_radius_px < 1 or self.iterations < 1:
             raise ValueError(
@@ -102,8 +103,8 @@ def match_stereo_rows(
     Degenerate input: windows without texture, repeated patterns and points near the border are not valid.
 
     References:
-        Baker & Matthews, Lucas–Kanade 20 years on, IJCV 2004 (inverse compositional). Keys, Cubic convolution
-        interpolation, 1981.
+        Baker & Matthews, Lucas–Kanade 20 years on, IJCV 2004 (inverse compositional). Unser, Splines: a perfect
+        fit for signal and image processing, 1999.
     """
     left, right = gray_pair(left, right, ("left", "right"))
     points = check_pixels(pixels)
@@ -120,6 +121,7 @@ def match_stereo_rows(
         whole, row_offset, ok = _search_fine(left, right, border, points[index], coarse, options)
         index, whole, row_offset = index[ok], whole[ok], row_offset[ok]
     if len(index):
+        left, right = spline_coefficients(left), spline_coefficients(right)
         found, correlation, deviation, ok = _refine(left, right, border, points[index], whole, row_offset, options)
         disparity[index], quality[index], sigma[index] = found, correlation, deviation
         valid[index[ok]] = True
@@ -210,8 +212,9 @@ def _unique_peak(score: np.ndarray, options: StereoOptions) -> tuple[np.ndarray,
     peak = np.take_along_axis(score, best[None], axis=0)[0]
     away = np.abs(np.arange(len(score))[:, None] - best) > 2
     second = np.max(np.where(away, score, np.float32(-1)), axis=0)
-    # Half-size windows hold less detail: the threshold proper applies at full size.
-    ok = (peak >= options.min_correlation - 0.1) & (1 - peak <= options.uniqueness * (1 - second))
+    # Half-size windows hold less detail: the threshold proper applies at full size. The 0.01 refuses two peaks that are
+    # both perfect but for rounding.
+    ok = (peak >= options.min_correlation - 0.1) & (1.01 - peak <= options.uniqueness * (1 - second))
     return best, ok
 
 
@@ -298,6 +301,8 @@ def _refine(left, right, border, points, disparity, row_offset, options: StereoO
     deviation = np.sqrt(np.maximum(variance, 0.25) * inverse[:, 2, 2] * np.square(weight).sum()) / gain
     deviation = np.sqrt(deviation**2 + options.sigma_floor_px**2)
     ok = (np.abs(step) < 0.05) & (theta[:, 0] > 0.4) & (theta[:, 0] < 2.5) & (correlation >= options.min_correlation)
-    ok &= (np.abs(current - disparity) < 1.5) & (np.abs(rows - row_offset) < 1.2) & (current >= options.min_disparity_px)
+    ok &= (
+        (np.abs(current - disparity) < 1.5) & (np.abs(rows - row_offset) < 1.2) & (current >= options.min_disparity_px)
+    )
     ok &= (current <= options.max_disparity_px) & (points[:, 0] - current >= radius)
     return current.astype(np.float32), correlation.astype(np.float32), deviation.astype(np.float32), ok

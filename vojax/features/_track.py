@@ -37,8 +37,8 @@ class TrackerOptions:
     def __post_init__(self) -> None:
         if self.window_px < 3 or self.levels < 0 or self.max_iterations < 1:
             raise ValueError(
-                f"window_px, levels, max_iterations are {self.window_px}, {self.levels}, {self.max_iterations}: expected "
-                "at least 3, 0 and 1"
+                f"window_px, levels, max_iterations are {self.window_px}, {self.levels}, {self.max_iterations}: "
+                "expected at least 3, 0 and 1"
             )
 
 
@@ -81,14 +81,16 @@ def track(
         ValueError: Images of different size or type, or `pixels` and `guess` that are not both `[n, 2]`.
 
     References:
-        Bouguet, Pyramidal implementation of the Lucas–Kanade feature tracker, 2000. Kalal et al., Forward-backward error,
-        ICPR 2010.
+        Bouguet, Pyramidal implementation of the Lucas–Kanade feature tracker, 2000. Kalal et al., Forward-backward
+        error, ICPR 2010.
     """
     gray0, gray1 = gray_pair(previous, current, ("previous", "current"))
     start = check_pixels(pixels)
     n = len(start)
     if guess is not None and np.shape(guess) != np.shape(pixels):
-        raise ValueError(f"guess has shape {np.shape(guess)} and pixels {np.shape(pixels)}: expected one row per feature")
+        raise ValueError(
+            f"guess has shape {np.shape(guess)} and pixels {np.shape(pixels)}: expected one row per feature"
+        )
     usable = inside(start, gray0.shape)
     end, quality, valid = np.where(usable[:, None], start, np.float32(0)), np.zeros(n, np.float32), np.zeros(n, bool)
     if not usable.any():

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from vojax._numerics import cholesky_solve, safe_divide, safe_norm, safe_sqrt
+from vojax._numerics import cholesky_solve, normalize, safe_divide, safe_norm, safe_sqrt
 from vojax._types import Array, ArrayLike, Bool, Float
 
 from ._null_vector import null_vector
@@ -70,10 +70,8 @@ def triangulate_rays(
     # In a frame along the mean ray, I - b bᵀ is small where it is small: bx² + by² has no cancellation, so nearly
     # parallel rays keep their depth in float32.
     mean = jnp.sum(w[:, None] * bearings, axis=0)
-    length = safe_norm(mean)
-    opposed = length < 1e-3
-    axis = jnp.where(opposed, bearings[jnp.argmax(w)], mean / jnp.where(opposed, 1.0, length))
-    frame = _frame_about(axis / jnp.sqrt(jnp.sum(axis * axis) + float(jnp.finfo(axis.dtype).tiny)))
+    axis = normalize(jnp.where(safe_norm(mean) < 1e-3, bearings[jnp.argmax(w)], mean))
+    frame = _frame_about(axis)
     origin = jnp.sum(w[:, None] * centers, axis=0)
     local = centers - origin[None, :]
     b = [jnp.sum(bearings * row[None, :], axis=1) for row in frame]
@@ -88,7 +86,8 @@ def triangulate_rays(
     r_x = jnp.sum(w * (c[0] - b[0] * along))
     r_y = jnp.sum(w * (c[1] - b[1] * along))
     r_z = jnp.sum(w * ((b[0] * b[0] + b[1] * b[1]) * c[2] - b[2] * (b[0] * c[0] + b[1] * c[1])))
-    solution, _ = cholesky_solve([[a_xx], [a_yx, a_yy], [a_zx, a_zy, a_zz]], [r_x, r_y, r_z])
+    matrix = jnp.stack([jnp.stack([a_xx, a_yx, a_zx]), jnp.stack([a_yx, a_yy, a_zy]), jnp.stack([a_zx, a_zy, a_zz])])
+    solution = cholesky_solve(matrix, jnp.stack([r_x, r_y, r_z])[:, None])[0][:, 0]
 
     spread = safe_sqrt(jnp.sum(w[:, None] * local * local))
     resolution = 4.0 * float(jnp.finfo(centers.dtype).eps)
@@ -249,7 +248,5 @@ def triangulate_dlt_inhomogeneous(
     References: Hartley & Zisserman, section 12.2.
     """
     rows = _dlt_rows(projections, pixels, mask)
-    a = [rows[:, i] for i in range(4)]
-    gram = [[jnp.sum(a[i] * a[j]) for j in range(i + 1)] for i in range(3)]
-    solution, _ = cholesky_solve(gram, [-jnp.sum(a[i] * a[3]) for i in range(3)])
-    return jnp.stack(solution)
+    gram = jnp.sum(rows[:, :, None] * rows[:, None, :], axis=0)
+    return cholesky_solve(gram[:3, :3], -gram[:3, 3:])[0][:, 0]

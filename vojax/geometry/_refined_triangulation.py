@@ -115,9 +115,8 @@ def _normal_equations(views: _Views, direction: Array, inverse: Array) -> tuple[
     return gram, gradient, jnp.sum(residuals * residuals)
 
 
-def _solve3(matrix: Array, rhs: Array) -> tuple[Array, Array]:
-    solution, ok = cholesky_solve([[matrix[i, j] for j in range(i + 1)] for i in range(3)], [rhs[i] for i in range(3)])
-    return jnp.stack(solution), ok
+def _solve(matrix: Array, rhs: Array) -> Array:
+    return cholesky_solve(matrix, rhs[:, None])[0][:, 0]
 
 
 @eqx.filter_custom_jvp
@@ -128,7 +127,7 @@ def _optimum(views: _Views, direction: Array, inverse: Array, *, steps: int) -> 
         direction, inverse, damping, gram, gradient, cost = state
         scale = jnp.diagonal(gram)
         damped = gram + jnp.diag(damping * scale + float(jnp.finfo(gram.dtype).eps) * (1.0 + jnp.max(scale)))
-        increment, _ = _solve3(damped, -gradient)
+        increment = _solve(damped, -gradient)
         # At most half a radian, and half the way to another scale of distance, at a time.
         length = safe_norm(increment[:2])
         increment = increment * jnp.minimum(1.0, safe_divide(jnp.full_like(length, 0.5), length) + (length == 0))
@@ -164,7 +163,7 @@ def _optimum_jvp(primals, tangents, *, steps):
     zero = jnp.zeros(3, direction.dtype)
     hessian = jax.jacfwd(jax.grad(cost))(zero, views)
     _, d_gradient = eqx.filter_jvp(lambda views: jax.grad(cost)(zero, views), (views,), (tangents[0],))
-    moved, _ = _solve3(hessian, -d_gradient)
+    moved = _solve(hessian, -d_gradient)
     return (direction, inverse), (moved[0] * basis[0] + moved[1] * basis[1], moved[2])
 
 
@@ -258,8 +257,7 @@ def triangulate_refine(
     basis = _tangent_basis(direction)
     # dX = distance (B dn - n distance / spread drho)
     chart = jnp.stack([basis[0], basis[1], -direction * (distance / spread)], axis=1) * distance
-    columns = [_solve3(gram, chart[i])[0] for i in range(3)]
-    covariance = chart @ jnp.stack(columns, axis=1)
+    covariance = chart @ cholesky_solve(gram, chart.T)[0]
     covariance = 0.5 * (covariance + covariance.T)
 
     x, y, z = _rays(views, direction, inverse)

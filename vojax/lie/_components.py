@@ -1,15 +1,13 @@
-"""Small vectors and matrices as tuples of components, so that a batch of any shape flows through elementwise.
+"""Small vectors as tuples of components and small matrices as sums of outer products: elementwise over any batch.
 
-A component is an array of batch shape; a vector is a tuple of components and a matrix a tuple of rows.
+A component is an array of batch shape. Matrices keep their two axes: as nine or more separate components they compiled
+three to ten times slower, without running faster.
 """
 
 import jax.numpy as jnp
 
 from vojax._numerics import Vector3, cross3, dot3
 from vojax._types import Array, ArrayLike
-
-Row = tuple[Array | float, ...]
-Matrix = tuple[Row, ...]
 
 
 def as_floating(x: ArrayLike | float | list | tuple, *trailing: int) -> Array:
@@ -25,10 +23,10 @@ def as_floating(x: ArrayLike | float | list | tuple, *trailing: int) -> Array:
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.zeros(()).dtype)
 
 
-def bounded_rotation(phi: Array) -> tuple[Array, ...]:
-    """Components of a rotation vector, clipped to ±1/eps radians: beyond, neighbouring floats are a radian apart."""
+def bounded_rotation(phi: Array) -> Array:
+    """Rotation vector clipped to ±1/eps radians: beyond, neighbouring floats are a radian apart."""
     limit = 1.0 / float(jnp.finfo(phi.dtype).eps)
-    return split(jnp.clip(phi, -limit, limit))
+    return jnp.clip(phi, -limit, limit)
 
 
 def align(*arrays: Array) -> tuple[Array, ...]:
@@ -37,7 +35,7 @@ def align(*arrays: Array) -> tuple[Array, ...]:
     return tuple(array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays)
 
 
-def split(vector: Array) -> tuple[Array, ...]:
+def split(vector: Array) -> tuple:
     """Components along the last axis."""
     return tuple(vector[..., i] for i in range(vector.shape[-1]))
 
@@ -56,48 +54,62 @@ def join(*vectors: Array) -> Array:
     return jnp.concatenate([jnp.broadcast_to(vector, (*shape, vector.shape[-1])) for vector in vectors], axis=-1)
 
 
-def stack_matrix(matrix: Matrix) -> Array:
-    """Rows of components to one array `[*batch, rows, columns]`."""
-    flat = stack(*(entry for row in matrix for entry in row))
-    return flat.reshape((*flat.shape[:-1], len(matrix), len(matrix[0])))
-
-
 def split_matrix(matrix: Array) -> tuple[tuple[Array, ...], ...]:
     """Components of the last two axes."""
     return tuple(tuple(matrix[..., i, j] for j in range(matrix.shape[-1])) for i in range(matrix.shape[-2]))
 
 
-def hat(v: Vector3) -> Matrix:
-    """Skew-symmetric matrix with `hat(v) p = v × p`."""
-    x, y, z = v
-    return ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
+def hat(v: Array) -> Array:
+    """Skew-symmetric matrix `[..., 3, 3]` with `hat(v) p = v × p`."""
+    x, y, z = split(v)
+    zero = jnp.zeros_like(x)
+    flat = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return flat.reshape((*v.shape[:-1], 3, 3))
 
 
-def matmul(a: Matrix, b: Matrix) -> Matrix:
-    """Matrix product of components."""
-    columns = range(len(b[0]))
-    return tuple(tuple(sum(a[i][k] * b[k][j] for k in range(len(b))) for j in columns) for i in range(len(a)))
+def outer(a: Array, b: Array) -> Array:
+    """Matrix a bᵀ over the last axes."""
+    return a[..., :, None] * b[..., None, :]
 
 
-def polynomial_in_hat(a: Array | float, b: Array, c: Array, phi: Vector3) -> Matrix:
+def eye_times(a: Array) -> Array:
+    """Matrix a I, 3x3."""
+    return a[..., None, None] * jnp.eye(3, dtype=a.dtype).reshape((1,) * a.ndim + (3, 3))
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """Product of 3x3 matrices as three sums of outer products, which stay elementwise over the batch."""
+    return sum((outer(a[..., :, k], b[..., k, :]) for k in range(1, 3)), outer(a[..., :, 0], b[..., 0, :]))
+
+
+def polynomial_in_hat(a: Array, b: Array, c: Array, phi: Array) -> Array:
     """Matrix `a I + b φ^ + c φ^²`, by φ^² = φφᵀ − |φ|² I."""
-    x, y, z = phi
-    bx, by, bz = b * x, b * y, b * z
-    cxy, cxz, cyz = c * x * y, c * x * z, c * y * z
-    return (
-        (a - c * (y * y + z * z), cxy - bz, cxz + by),
-        (cxy + bz, a - c * (x * x + z * z), cyz - bx),
-        (cxz - by, cyz + bx, a - c * (x * x + y * y)),
-    )
+    u = squared_norm(split(phi))
+    return eye_times(a - c * u) + hat(b[..., None] * phi) + outer(c[..., None] * phi, phi)
 
 
-def polynomial_in_hat_times(a: Array | float, b: Array, c: Array, phi: Vector3, v: Vector3) -> Vector3:
+def blocks(rows: list[list[Array]]) -> Array:
+    """Matrix from its blocks; they share their leading axes."""
+    return jnp.concatenate([jnp.concatenate(row, axis=-1) for row in rows], axis=-2)
+
+
+def polynomial_in_hat_times(a: Array, b: Array, c: Array, phi: Array, vector: Array) -> Array:
     """Product of `a I + b φ^ + c φ^²` with a vector."""
-    first = cross3(phi, v)
-    second = cross3(phi, first)
-    return tuple(a * v[i] + b * first[i] + c * second[i] for i in range(3))  # type: ignore[return-value]
+    axis, v = split(phi), split(vector)
+    first = cross3(axis, v)
+    second = cross3(axis, first)
+    return stack(*(a * v[i] + b * first[i] + c * second[i] for i in range(3)))
 
 
 def squared_norm(v: Vector3) -> Array:
     """Sum of squares of the components."""
     return dot3(v, v)
+
+
+def homogeneous(linear: Array, translation: Array) -> Array:
+    """Matrix [[linear, translation], [0, 1]]."""
+    last = jnp.broadcast_to(
+        jnp.asarray([0.0, 0.0, 0.0, 1.0], linear.dtype).reshape((1,) * (linear.ndim - 1) + (4,)),
+        (*linear.shape[:-2], 1, 4),
+    )
+    return jnp.concatenate([jnp.concatenate([linear, translation[..., None]], axis=-1), last], axis=-2)

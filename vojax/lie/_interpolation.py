@@ -53,7 +53,7 @@ def cumulative_compose(increments: Group, start: Group | None = None, *, include
     kind: Any = type(increments)
     first = kind.identity(batch_axes[1:], increments.parameters().dtype) if start is None else start
     chain = jax.lax.associative_scan(lambda left, right: left.multiply(right).normalize(), increments)
-    poses = chain if start is None else start.multiply(chain).normalize()
+    poses: Any = chain if start is None else start.multiply(chain).normalize()
     if not include_start:
         return poses
     head = jnp.broadcast_to(first.parameters()[None], (1, *poses.parameters().shape[1:]))

@@ -12,19 +12,21 @@ from vojax._types import Array, ArrayLike, Float, PRNGKeyArray
 
 from ._coefficients import inverse_coefficients, stumpff
 from ._components import (
-    Matrix,
     align,
     as_floating,
+    blocks,
     bounded_rotation,
+    eye_times,
     hat,
+    homogeneous,
     join,
     matmul,
+    outer,
     polynomial_in_hat,
     polynomial_in_hat_times,
     split,
     squared_norm,
     stack,
-    stack_matrix,
 )
 from ._so3 import SO3
 
@@ -77,7 +79,7 @@ class SE3(eqx.Module):
         """
         rho, phi, u, (_, _, c2, c3, *_) = _tangent_parts(tangent)
         translation = polynomial_in_hat_times(jnp.ones_like(u), c2, c3, phi, rho)
-        return SE3(join(SO3.exp(stack(*phi)).wxyz, stack(*translation)))
+        return SE3(join(SO3.exp(phi).wxyz, translation))
 
     def log(self) -> Float[Array, "*batch 6"]:
         """Tangent (ρ, φ) of the motion, |φ| ≤ π.
@@ -85,11 +87,11 @@ class SE3(eqx.Module):
         Degenerate input: as `SO3.log`.
         Differentiability: both modes, at the identity and at half a turn as well (one-sided there).
         """
-        phi = split(self.rotation().log())
-        u = squared_norm(phi)
+        phi = self.rotation().log()
+        u = squared_norm(split(phi))
         _, _, c2, c3, *_ = stumpff(u)
         coefficients = inverse_coefficients(jnp.ones_like(u), c2, c3, u)
-        return stack(*polynomial_in_hat_times(*coefficients, phi, split(self.translation())), *phi)
+        return join(polynomial_in_hat_times(*coefficients, phi, self.translation()), phi)
 
     @staticmethod
     def from_matrix(matrix: Float[ArrayLike, "*batch 4 4"]) -> "SE3":
@@ -102,9 +104,7 @@ class SE3(eqx.Module):
 
     def as_matrix(self) -> Float[Array, "*batch 4 4"]:
         """Homogeneous matrix [[R, t], [0, 1]]."""
-        rows = self.rotation()._matrix_components()
-        t = split(self.translation())
-        return stack_matrix((*((*rows[i], t[i]) for i in range(3)), (0.0, 0.0, 0.0, 1.0)))
+        return homogeneous(self.rotation().as_matrix(), self.translation())
 
     def inverse(self) -> "SE3":
         """Motion back: `b_from_a.inverse()` is `a_from_b`."""
@@ -132,8 +132,8 @@ class SE3(eqx.Module):
 
     def adjoint(self) -> Float[Array, "*batch 6 6"]:
         """Matrix with `T exp(ξ) T⁻¹ = exp(Ad ξ)`."""
-        rotation = self.rotation()._matrix_components()
-        return _block_triangular(rotation, matmul(hat(split(self.translation())), rotation), rotation)
+        rotation = self.rotation().as_matrix()
+        return _block_triangular(rotation, matmul(hat(self.translation()), rotation), rotation)
 
     def parameters(self) -> Float[Array, "*batch 7"]:
         """Stored numbers (w, x, y, z, tx, ty, tz)."""
@@ -164,7 +164,7 @@ class SE3(eqx.Module):
         rho, phi, u, (_, _, c2, c3, c4, c5) = _tangent_parts(tangent)
         inverse = polynomial_in_hat(*inverse_coefficients(jnp.ones_like(u), c2, c3, u), phi)
         coupling = matmul(matmul(inverse, _coupling(rho, phi, u, c2, c3, c4, c5)), inverse)
-        return _block_triangular(inverse, tuple(tuple(-entry for entry in row) for row in coupling), inverse)
+        return _block_triangular(inverse, -coupling, inverse)
 
     @staticmethod
     def jacobian_right_inverse(tangent: Float[ArrayLike, "*batch 6"]) -> Float[Array, "*batch 6 6"]:
@@ -188,31 +188,24 @@ class SE3(eqx.Module):
 
 def _tangent_parts(tangent):
     tangent = as_floating(tangent, 6)
-    rho, phi = split(tangent[..., :3]), bounded_rotation(tangent[..., 3:])
-    u = squared_norm(phi)
+    rho, phi = tangent[..., :3], bounded_rotation(tangent[..., 3:])
+    u = squared_norm(split(phi))
     return rho, phi, u, stumpff(u)
 
 
-def _coupling(rho, phi, u, c2, c3, c4, c5) -> Matrix:
+def _coupling(rho, phi, u, c2, c3, c4, c5) -> Array:
     """Block Q of the left Jacobian [[J, Q], [0, J]] (Barfoot, eq. 7.86).
 
     With φ^ρ^ = ρφᵀ − (φ·ρ)I and φ^ρ^φ^ = −(φ·ρ)φ^ its eight triple products collapse to
     Q = c₂ ρ^ + c₃ (ρφᵀ + φρᵀ − 2(φ·ρ)I) + (φ·ρ) [(2c₄ − c₃) φ^ − (c₄ − 3c₅)(φφᵀ − |φ|²I)].
     """
-    d = dot3(phi, rho)
-    skew = hat(tuple(c2 * rho[i] + d * (2.0 * c4 - c3) * phi[i] for i in range(3)))
+    d = dot3(split(phi), split(rho))
     e = d * (c4 - 3.0 * c5)
-    diagonal = e * u - 2.0 * c3 * d
-    return tuple(
-        tuple(
-            skew[i][j] + c3 * (rho[i] * phi[j] + phi[i] * rho[j]) - e * phi[i] * phi[j] + (diagonal if i == j else 0.0)
-            for j in range(3)
-        )
-        for i in range(3)
-    )
+    skew = hat(c2[..., None] * rho + (d * (2.0 * c4 - c3))[..., None] * phi)
+    symmetric = outer(rho, phi) + outer(phi, rho)
+    return skew + eye_times(e * u - 2.0 * c3 * d) + c3[..., None, None] * symmetric - outer(e[..., None] * phi, phi)
 
 
-def _block_triangular(upper: Matrix, corner: Matrix, lower: Matrix) -> Array:
+def _block_triangular(upper: Array, corner: Array, lower: Array) -> Array:
     """Array of [[upper, corner], [0, lower]]."""
-    zero = (0.0, 0.0, 0.0)
-    return stack_matrix((*((*upper[i], *corner[i]) for i in range(3)), *((*zero, *lower[i]) for i in range(3))))
+    return blocks([[upper, corner], [jnp.zeros_like(upper), lower]])

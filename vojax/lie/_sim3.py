@@ -13,20 +13,21 @@ from vojax._types import Array, ArrayLike, Float, PRNGKeyArray
 
 from ._coefficients import inverse_coefficients, similarity_coefficients, stumpff
 from ._components import (
-    Matrix,
     align,
     as_floating,
+    blocks,
     bounded_rotation,
+    eye_times,
     hat,
+    homogeneous,
     join,
     matmul,
+    outer,
     polynomial_in_hat,
     polynomial_in_hat_times,
     split,
-    split_matrix,
     squared_norm,
     stack,
-    stack_matrix,
 )
 from ._so3 import SO3
 
@@ -86,7 +87,7 @@ class Sim3(eqx.Module):
         """
         rho, phi, sigma, _, (a, b, c) = _tangent_parts(tangent)
         translation = polynomial_in_hat_times(a, b, c, phi, rho)
-        return Sim3(join(SO3.exp(stack(*phi)).wxyz, stack(*translation, jnp.exp(sigma))))
+        return Sim3(join(SO3.exp(phi).wxyz, translation, jnp.exp(sigma)[..., None]))
 
     def log(self) -> Float[Array, "*batch 7"]:
         """Tangent (ρ, φ, log s) of the similarity, |φ| ≤ π.
@@ -94,12 +95,12 @@ class Sim3(eqx.Module):
         Degenerate input: as `SO3.log`; a scale that is not positive counts as 1.
         Differentiability: both modes, at the identity and at half a turn as well (one-sided there).
         """
-        phi = split(self.rotation().log())
+        phi = self.rotation().log()
         scale = self.scale()
         sigma = jnp.log(jnp.where(scale > 0, scale, 1.0))
-        u = squared_norm(phi)
+        u = squared_norm(split(phi))
         coefficients = inverse_coefficients(*similarity_coefficients(sigma, u), u)
-        return stack(*polynomial_in_hat_times(*coefficients, phi, split(self.translation())), *phi, sigma)
+        return join(polynomial_in_hat_times(*coefficients, phi, self.translation()), phi, sigma[..., None])
 
     @staticmethod
     def from_matrix(matrix: Float[ArrayLike, "*batch 4 4"]) -> "Sim3":
@@ -109,16 +110,15 @@ class Sim3(eqx.Module):
         Differentiability: both modes, for every rotation.
         """
         matrix = as_floating(matrix, 4, 4)
-        linear = split_matrix(matrix[..., :3, :3])
+        linear = matrix[..., :3, :3]
         # ‖sR‖² = 3 s²: a root without a sign to choose, unlike that of the determinant.
-        scale = safe_sqrt(sum(squared_norm((x, y, z)) for x, y, z in linear) / jnp.asarray(3.0, matrix.dtype))
-        rotation = stack_matrix(tuple(tuple(safe_divide(entry, scale) for entry in row) for row in linear))
+        scale = safe_sqrt(jnp.sum(linear * linear, axis=(-2, -1)) / 3.0)
+        rotation = safe_divide(linear, jnp.broadcast_to(scale[..., None, None], linear.shape))
         return Sim3.from_rotation_translation_scale(SO3.from_matrix(rotation), matrix[..., :3, 3], scale)
 
     def as_matrix(self) -> Float[Array, "*batch 4 4"]:
         """Homogeneous matrix [[s R, t], [0, 1]]."""
-        rows, t = self._linear_components(), split(self.translation())
-        return stack_matrix((*((*rows[i], t[i]) for i in range(3)), (0.0, 0.0, 0.0, 1.0)))
+        return homogeneous(self.scale()[..., None, None] * self.rotation().as_matrix(), self.translation())
 
     def inverse(self) -> "Sim3":
         """Similarity back: `b_from_a.inverse()` is `a_from_b`."""
@@ -153,11 +153,8 @@ class Sim3(eqx.Module):
 
     def adjoint(self) -> Float[Array, "*batch 7 7"]:
         """Matrix with `T exp(ξ) T⁻¹ = exp(Ad ξ)`."""
-        rotation = self.rotation()._matrix_components()
-        t = split(self.translation())
-        return _blocks(
-            self._linear_components(), matmul(hat(t), rotation), tuple(-component for component in t), rotation
-        )
+        rotation, t = self.rotation().as_matrix(), self.translation()
+        return _blocks(self.scale()[..., None, None] * rotation, matmul(hat(t), rotation), -t, rotation)
 
     def parameters(self) -> Float[Array, "*batch 8"]:
         """Stored numbers (w, x, y, z, tx, ty, tz, s)."""
@@ -197,8 +194,8 @@ class Sim3(eqx.Module):
         coupling = matmul(matmul(linear_inverse, coupling), rotation_inverse)
         return _blocks(
             linear_inverse,
-            tuple(tuple(-entry for entry in row) for row in coupling),
-            tuple(-entry for entry in polynomial_in_hat_times(*linear, phi, column)),
+            -coupling,
+            -polynomial_in_hat_times(*linear, phi, column),
             rotation_inverse,
         )
 
@@ -221,21 +218,17 @@ class Sim3(eqx.Module):
         """Leading axes."""
         return self.wxyz_xyz_scale.shape[:-1]
 
-    def _linear_components(self) -> Matrix:
-        scale = self.scale()
-        return tuple(tuple(scale * entry for entry in row) for row in self.rotation()._matrix_components())
-
 
 def _tangent_parts(tangent):
     tangent = as_floating(tangent, 7)
-    rho, phi = split(tangent[..., :3]), bounded_rotation(tangent[..., 3:6])
+    rho, phi = tangent[..., :3], bounded_rotation(tangent[..., 3:6])
     limit = 0.75 * math.log(float(jnp.finfo(tangent.dtype).max))
     sigma = jnp.clip(tangent[..., 6], -limit, limit)
-    u = squared_norm(phi)
+    u = squared_norm(split(phi))
     return rho, phi, sigma, u, similarity_coefficients(sigma, u)
 
 
-def _coupling(rho, phi, sigma, u, rotation_jacobian: Matrix) -> tuple[Matrix, tuple[Array, ...]]:
+def _coupling(rho, phi, sigma, u, rotation_jacobian: Array) -> tuple[Array, Array]:
     """Blocks Q and w of the left Jacobian [[V, Q, w], [0, J, 0], [0, 0, 1]].
 
     exp moves the translation t = V(φ, σ) ρ by V dρ + Q dφ + w dσ + (dσ I + (J dφ)^) t in the left frame, hence
@@ -246,32 +239,21 @@ def _coupling(rho, phi, sigma, u, rotation_jacobian: Matrix) -> tuple[Matrix, tu
     _, (a_s, b_s, c_s) = jax.jvp(lambda s: similarity_coefficients(s, u), (sigma,), (one,))
     t = polynomial_in_hat_times(a, b, c, phi, rho)
     # ∂(φ × (φ × ρ))/∂φ = φρᵀ + (φ·ρ)I − 2ρφᵀ, and ∂f(u)/∂φ = 2 f' φᵀ.
-    d = dot3(phi, rho)
-    along = polynomial_in_hat_times(zero, 2.0 * b_u, 2.0 * c_u, phi, rho)
-    turn = hat(tuple(-b * component for component in rho))
-    moved = matmul(hat(t), rotation_jacobian)
-    coupling = tuple(
-        tuple(
-            turn[i][j]
-            + c * (phi[i] * rho[j] - 2.0 * rho[i] * phi[j])
-            + (c * d if i == j else 0.0)
-            + along[i] * phi[j]
-            + moved[i][j]
-            for j in range(3)
-        )
-        for i in range(3)
+    along = polynomial_in_hat_times(zero, 2.0 * b_u, 2.0 * c_u, phi, rho) - 2.0 * c[..., None] * rho
+    coupling = (
+        eye_times(c * dot3(split(phi), split(rho)))
+        - hat(b[..., None] * rho)
+        + outer(c[..., None] * phi, rho)
+        + outer(along, phi)
+        + matmul(hat(t), rotation_jacobian)
     )
-    stretch = polynomial_in_hat_times(a_s, b_s, c_s, phi, rho)
-    return coupling, tuple(stretch[i] - t[i] for i in range(3))
+    return coupling, polynomial_in_hat_times(a_s, b_s, c_s, phi, rho) - t
 
 
-def _blocks(upper: Matrix, corner: Matrix, column: tuple[Array, ...], lower: Matrix) -> Array:
+def _blocks(upper: Array, corner: Array, column: Array, lower: Array) -> Array:
     """Array of [[upper, corner, column], [0, lower, 0], [0, 0, 1]]."""
-    zero = (0.0, 0.0, 0.0)
-    return stack_matrix(
-        (
-            *((*upper[i], *corner[i], column[i]) for i in range(3)),
-            *((*zero, *lower[i], 0.0) for i in range(3)),
-            (*zero, *zero, 1.0),
-        )
+    square, tall = jnp.zeros_like(upper), jnp.zeros_like(column)[..., None]
+    wide = jnp.swapaxes(tall, -1, -2)
+    return blocks(
+        [[upper, corner, column[..., None]], [square, lower, tall], [wide, wide, jnp.ones_like(wide[..., :1])]]
     )

@@ -20,7 +20,6 @@ from ._components import (
     split_matrix,
     squared_norm,
     stack,
-    stack_matrix,
 )
 
 
@@ -58,7 +57,7 @@ class SO3(eqx.Module):
         clipped.
         Differentiability: both modes, any order, at the zero tangent as well.
         """
-        x, y, z = bounded_rotation(as_floating(tangent, 3))
+        x, y, z = split(bounded_rotation(as_floating(tangent, 3)))
         # cos(θ/2) and sin(θ/2)/θ are even in θ, hence smooth functions of θ².
         cosine, sine_ratio, *_ = stumpff(0.25 * squared_norm((x, y, z)))
         half = 0.5 * sine_ratio
@@ -106,7 +105,8 @@ class SO3(eqx.Module):
 
     def as_matrix(self) -> Float[Array, "*batch 3 3"]:
         """Rotation matrix."""
-        return stack_matrix(self._matrix_components())
+        w, v = self.wxyz[..., 0], self.wxyz[..., 1:]
+        return polynomial_in_hat(jnp.ones_like(w), 2.0 * w, jnp.full_like(w, 2.0), v)
 
     def inverse(self) -> "SO3":
         """Rotation the other way: the conjugate quaternion."""
@@ -165,8 +165,8 @@ class SO3(eqx.Module):
     def jacobian_left(tangent: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
         """Matrix with `exp(φ + δ) ≈ exp(J δ) exp(φ)` for small δ."""
         phi = bounded_rotation(as_floating(tangent, 3))
-        _, c1, c2, c3, *_ = stumpff(squared_norm(phi))
-        return stack_matrix(polynomial_in_hat(jnp.ones_like(c1), c2, c3, phi))
+        _, c1, c2, c3, *_ = stumpff(squared_norm(split(phi)))
+        return polynomial_in_hat(jnp.ones_like(c1), c2, c3, phi)
 
     @staticmethod
     def jacobian_right(tangent: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
@@ -180,9 +180,9 @@ class SO3(eqx.Module):
         Degenerate input: no inverse exists at whole turns other than zero; the numbers returned there are finite.
         """
         phi = bounded_rotation(as_floating(tangent, 3))
-        u = squared_norm(phi)
+        u = squared_norm(split(phi))
         _, _, c2, c3, *_ = stumpff(u)
-        return stack_matrix(polynomial_in_hat(*inverse_coefficients(jnp.ones_like(u), c2, c3, u), phi))
+        return polynomial_in_hat(*inverse_coefficients(jnp.ones_like(u), c2, c3, u), phi)
 
     @staticmethod
     def jacobian_right_inverse(tangent: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
@@ -203,14 +203,3 @@ class SO3(eqx.Module):
     def get_batch_axes(self) -> tuple[int, ...]:
         """Leading axes."""
         return self.wxyz.shape[:-1]
-
-    def _matrix_components(self) -> tuple[tuple[Array, Array, Array], ...]:
-        w, x, y, z = split(self.wxyz)
-        x2, y2, z2 = 2.0 * x, 2.0 * y, 2.0 * z
-        xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
-        wx, wy, wz = w * x2, w * y2, w * z2
-        return (
-            (1.0 - (yy + zz), xy - wz, xz + wy),
-            (xy + wz, 1.0 - (xx + zz), yz - wx),
-            (xz - wy, yz + wx, 1.0 - (xx + yy)),
-        )

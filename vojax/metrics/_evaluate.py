@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from vojax._types import Float
-from vojax.solvers import procrustes, umeyama
+from vojax.solvers import umeyama
 
 from ._association import associate
 from ._kitti import kitti_errors
@@ -209,23 +209,29 @@ def _best_transform(
     return (1.0, np.eye(4)) if found is None else found
 
 
+_similarity = jax.jit(umeyama)
+
+
 def _fit(
     points0: Float[np.ndarray, "n 3"], points1: Float[np.ndarray, "n 3"], alignment: Alignment
 ) -> tuple[float, Float[np.ndarray, "4 4"]] | None:
-    if len(points0) < 3:
-        return None
+    mean0, mean1 = points0.mean(axis=0), points1.mean(axis=0)
+    # Least squares sees the centred points through their second moments alone, and so do the six rows of the
+    # triangular factor; with their negatives they are centred too. One compilation then serves every length.
+    rows = np.linalg.qr(np.concatenate([points0 - mean0[None], points1 - mean1[None]], axis=1), mode="r")
+    rows = np.pad(rows, ((0, 6 - len(rows)), (0, 0)))
+    rows = np.concatenate([rows, -rows])
     with jax.enable_x64(True):
-        if alignment == "se3":
-            rigid = procrustes(points0, points1)
-            valid, scale = bool(rigid.valid[0]), 1.0
-            matrix = np.array(rigid.models.as_matrix()[0], np.float64)
-        else:
-            similar = umeyama(points0, points1)
-            valid, scale = bool(similar.valid[0]), float(similar.models.scale()[0])
-            matrix = np.eye(4)
-            matrix[:3, :3] = similar.models.rotation().as_matrix()[0]
-            matrix[:3, 3] = similar.models.translation()[0]
-    return (scale, matrix) if valid else None
+        found = _similarity(rows[:, :3], rows[:, 3:])
+        if not bool(found.valid[0]):
+            return None
+        rotation = np.asarray(found.models.rotation().as_matrix()[0])
+        # The best rotation is the same with and without scale.
+        scale = float(found.models.scale()[0]) if alignment == "sim3" else 1.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = mean1 - scale * rotation @ mean0
+    return scale, matrix
 
 
 def _attached_points(trajectory: Trajectory, reach: float) -> Float[np.ndarray, "m 3"]:

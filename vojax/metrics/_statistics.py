@@ -65,8 +65,6 @@ def nees(error: Float[ArrayLike, "*batch d"], covariance: Float[ArrayLike, "*bat
         2.0
     """
     error, covariance = jnp.asarray(error), jnp.asarray(covariance)
-    d = error.shape[-1]
-    entries = [[covariance[..., i, j] for j in range(d)] for i in range(d)]
-    solution, ok = cholesky_solve(entries, [error[..., i] for i in range(d)])
-    value = jnp.sum(error * jnp.stack(solution, axis=-1), axis=-1)
+    solution, ok = cholesky_solve(jnp.moveaxis(covariance, (-2, -1), (0, 1)), jnp.moveaxis(error, -1, 0)[:, None])
+    value = jnp.sum(error * jnp.moveaxis(solution[:, 0], 0, -1), axis=-1)
     return jnp.where(ok, value, jnp.finfo(value.dtype).max)

@@ -176,27 +176,17 @@ def _estimate(
     dtype = points_world.dtype
     shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)
     start = SE3(_pose(found.model).wxyz_xyz.astype(dtype))
-    # Once more on the inliers of the refined pose, which is where the estimate differentiates.
-    first = refine_absolute_pose(
-        jax.lax.stop_gradient(start),
-        *jax.lax.stop_gradient((centered, pixels, camera)),
-        sigma_px=jax.lax.stop_gradient(sigma_px),
-        mask=found.inliers,
-        options=LMOptions(max_steps=options.local_steps),
-    ).model
-    inliers, _ = _judge(first, centered, pixels, camera, mask, options)
-    inliers = jnp.where(jnp.sum(inliers) >= jnp.sum(found.inliers), inliers, found.inliers)
     refined = refine_absolute_pose(
-        first,
+        start,
         centered,
         pixels,
         camera,
         sigma_px=sigma_px,
-        mask=inliers,
+        mask=found.inliers,
         options=LMOptions(max_steps=options.final_steps),
     )
-    inliers_after, score = _judge(refined.model, centered, pixels, camera, mask, options)
-    num_inliers = jnp.sum(inliers_after)
+    inliers, score = _judge(refined.model, centered, pixels, camera, mask, options)
+    num_inliers = jnp.sum(inliers)
     result = Result.where(num_inliers > 3, refined.result, Result.no_consensus)
     result = Result.where(count >= 4, result, Result.too_few)
     usable = (result == Result.success) | (result == Result.not_converged)
@@ -204,7 +194,7 @@ def _estimate(
     model = SE3(jnp.where(usable, model.wxyz_xyz, SE3.identity(dtype=dtype).wxyz_xyz))
     return Estimate(
         model,
-        inliers_after & usable,
+        inliers & usable,
         jnp.where(usable, num_inliers, 0),
         jnp.where(usable, score, count.astype(dtype)),
         found.num_hypotheses,
@@ -216,7 +206,7 @@ def _estimate(
 def _judge(
     model: SE3, points: Array, pixels: Array, camera: Any, mask: Array, options: RansacOptions
 ) -> tuple[Array, Array]:
-    """Inliers and score at a pose, in the caller's precision; constants for differentiation."""
+    """Inliers and score at a pose, in the caller's precision; constants to differentiation."""
     model, points, pixels, camera = jax.lax.stop_gradient((model, points, pixels, camera))
     points_cam = model.apply(points)
     error = camera.project(points_cam) - pixels

@@ -82,8 +82,9 @@ def search(
     count = jnp.sum(mask).astype(jnp.int32)
     weights = mask.astype(dtype)
     order = sampling_order(mask, quality)
-    # The coarse subset is a fixed random choice among the observations that count.
-    shuffled = jnp.argsort(jnp.where(mask, jax.random.uniform(jax.random.fold_in(key, -1), (n,)), jnp.inf))
+    key, subset_key = jax.random.split(key)
+    # The coarse subset is one random choice among the observations that count.
+    shuffled = jnp.argsort(jnp.where(mask, jax.random.uniform(subset_key, (n,)), jnp.inf))
     coarse = shuffled[: min(options.coarse_points, n)]
     coarse_observations = tuple(component[coarse] for component in estimator.observations)
     num_chunks = -(-options.max_hypotheses // k)

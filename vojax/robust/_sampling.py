@@ -60,7 +60,7 @@ def draw_samples(
         for j in range(i, 0, -1):
             low, high = jnp.minimum(chosen[j - 1], chosen[j]), jnp.maximum(chosen[j - 1], chosen[j])
             chosen[j - 1], chosen[j] = low, high
-    positions = jnp.minimum(jnp.stack(chosen), jnp.maximum(pool - 1, 0))
+    positions = jnp.minimum(jnp.stack(chosen), jnp.maximum(pool - 1, 0)[None])
     return order[positions]
 
 

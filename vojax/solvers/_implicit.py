@@ -27,9 +27,25 @@ LinearSolve = Callable[[Array, Array], Array]
 Pose = TypeVar("Pose", SE3, Sim3)
 
 
-def retract_camera(cam_from_world: Pose, tangent: Float[Array, "d"]) -> Pose:
-    """Perturb a pose in the camera's frame: `world_from_cam @ exp(ξ)`, which is `exp(-ξ) @ cam_from_world`."""
-    return type(cam_from_world).exp(-tangent) @ cam_from_world
+def perturb_camera(cam_from_world: Pose, tangent: Float[Array, "d"]) -> Pose:
+    """Perturb a pose in the camera's frame, `world_from_cam @ exp(ξ)` or `exp(-ξ) @ cam_from_world`, to first order.
+
+    A derivative needs no more than that, and without the exponential it compiles several times faster.
+    """
+    parameters = cam_from_world.parameters()
+    w, axis, translation = parameters[0], parameters[1:4], parameters[4:7]
+    rho, phi = tangent[:3], tangent[3:6]
+    half = 0.5 * phi
+    changes = [
+        jnp.dot(half, axis)[None],
+        -half * w - jnp.cross(half, axis),
+        -rho - jnp.cross(phi, translation),
+    ]
+    if isinstance(cam_from_world, Sim3):
+        growth = tangent[6]
+        changes[2] = changes[2] - growth * translation
+        changes.append(-growth * parameters[7:])
+    return type(cam_from_world)(parameters + jnp.concatenate(changes))
 
 
 def solve_square(matrix: Float[Array, "d d"], rhs: Float[Array, "d"]) -> Float[Array, "d"]:
@@ -46,51 +62,40 @@ def solve_square(matrix: Float[Array, "d d"], rhs: Float[Array, "d"]) -> Float[A
         The solution, or zeros for a singular or non-finite matrix.
     """
     size = rhs.shape[0]
-    matrix = jnp.where(jnp.all(jnp.isfinite(matrix)), matrix, 0.0)
-    floor = tiny(matrix)
-    row_scale = 1.0 / jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1)), floor)
+    rows = jnp.arange(size)
+    regular = jnp.all(jnp.isfinite(matrix))
+    matrix = jnp.where(regular, matrix, 0.0)
+    row_scale = 1.0 / jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=1)), tiny(matrix))
     matrix, rhs = matrix * row_scale[:, None], rhs * row_scale
-    column_scale = 1.0 / jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=0)), floor)
+    column_scale = 1.0 / jnp.maximum(jax.lax.stop_gradient(jnp.max(jnp.abs(matrix), axis=0)), tiny(matrix))
     matrix = matrix * column_scale[None, :]
+    smallest = 8 * size * float(jnp.finfo(matrix.dtype).eps)
 
-    # A singular matrix is replaced by the identity before anything is divided by its pivots.
-    regular = _smallest_pivot(jax.lax.stop_gradient(matrix)) > 8 * size * float(jnp.finfo(matrix.dtype).eps)
-    matrix = jnp.where(regular, matrix, jnp.eye(size, dtype=matrix.dtype))
-    rhs = jnp.where(regular, rhs, 0.0)
-    rows = jnp.arange(size)
-    for k in range(size):
-        swap = _pivot_row(matrix[:, k], rows, k)
-        matrix, rhs = _swap(matrix, k, swap, rows), _swap(rhs, k, swap, rows)
-        factor = jnp.where(rows == k, 0.0, matrix[:, k] / matrix[k, k])
-        matrix = matrix - factor[:, None] * matrix[k][None, :]
-        rhs = rhs - factor * rhs[k]
-    return rhs / jnp.diagonal(matrix) * column_scale
+    # A loop, not unrolled: fusion would recompute every earlier step in each later one.
+    def eliminate(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        matrix, rhs, regular = state
+        is_k = rows == k
+        column = jnp.sum(jnp.where(is_k[None, :], matrix, 0.0), axis=1)
+        candidates = jnp.where(rows >= k, jnp.abs(jax.lax.stop_gradient(column)), -1.0)
+        is_pivot = rows == jnp.argmax(candidates)
+        pivot = jnp.sum(jnp.where(is_pivot, column, 0.0))
+        usable = jnp.abs(pivot) > smallest
+        # Divide by the pivot only where it is one: a masked result with infinite factors would give 0 · inf backwards.
+        inverse = jnp.where(usable, 1.0 / jnp.where(usable, pivot, 1.0), 0.0)
 
+        def step(x: Array, factor: Array) -> Array:
+            lead = (slice(None),) + (None,) * (x.ndim - 1)
+            row_k = jnp.sum(jnp.where(is_k[lead], x, 0.0), axis=0)[None]
+            row_pivot = jnp.sum(jnp.where(is_pivot[lead], x, 0.0), axis=0)[None] * inverse
+            x = jnp.where(is_pivot[lead], row_k, x)
+            return jnp.where(is_k[lead], row_pivot, x - factor[lead] * row_pivot)
 
-def _pivot_row(column: Array, rows: Array, k: int) -> Array:
-    return jnp.argmax(jnp.where(rows >= k, jnp.abs(jax.lax.stop_gradient(column)), -1.0))
+        column_k = jnp.sum(jnp.where(is_k, column, 0.0))
+        factor = jnp.where(is_pivot, column_k, column)
+        return step(matrix, factor), step(rhs, factor), regular & usable
 
-
-def _swap(x: Array, k: int, other: Array, rows: Array) -> Array:
-    """Exchange rows k and `other`, by masks instead of a gather."""
-    lead = (slice(None),) + (None,) * (x.ndim - 1)
-    is_other = (rows == other)[lead]
-    from_other = jnp.sum(jnp.where(is_other, x, 0.0), axis=0)
-    swapped = jnp.where(is_other, x[k][None], x)
-    return jnp.where((rows == k)[lead], from_other[None], swapped)
-
-
-def _smallest_pivot(matrix: Array) -> Array:
-    size = matrix.shape[0]
-    rows = jnp.arange(size)
-    smallest = jnp.asarray(jnp.inf, matrix.dtype)
-    for k in range(size):
-        matrix = _swap(matrix, k, _pivot_row(matrix[:, k], rows, k), rows)
-        pivot = jnp.abs(matrix[k, k])
-        smallest = jnp.minimum(smallest, pivot)
-        factor = jnp.where(rows > k, matrix[:, k] / jnp.where(pivot > 0, matrix[k, k], 1.0), 0.0)
-        matrix = matrix - factor[:, None] * matrix[k][None, :]
-    return smallest
+    matrix, rhs, regular = jax.lax.fori_loop(0, size, eliminate, (matrix, rhs, regular))
+    return jnp.where(regular, rhs * column_scale, 0.0)
 
 
 def implicit(
@@ -108,8 +113,9 @@ def implicit(
         residual: `(model, data) -> [tangent_dim]`, as many equations as tangent coordinates, zero at a solution: the
             equations of a minimal solver, or the gradient of a cost at its optimum. It must have finite derivatives at
             the placeholder model with all data zero, which stand in for a slot that is not valid.
-        retract: `(model, ξ) -> model`, a chart with `retract(model, 0) = model`. The derivative does not depend on the
-            chart, the conditioning of the linear system does: see `retract_camera`.
+        retract: `(model, ξ) -> model` with `retract(model, 0) = model`, a chart of the manifold or one correct to first
+            order. The derivative does not depend on the chart; the conditioning of the linear system does, hence
+            `perturb_camera` for poses.
         tangent_dim: Number of degrees of freedom of the model.
         linear_solve: `(matrix, rhs) -> solution`, linear in `rhs`; decides singularity from the matrix alone and
             returns zeros there.
@@ -144,4 +150,5 @@ def implicit(
         leaves = [*jax.tree.leaves(models_tangent), no_tangent]
         return candidates, jax.tree.unflatten(jax.tree.structure(candidates), leaves)
 
-    return solver
+    # Compiled once, so that calls outside `jit` do not compile the loops of a solver each time.
+    return jax.jit(solver)

@@ -20,33 +20,24 @@ References:
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 
 from vojax._numerics import Vector3, cross3, dot3, normalize
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
-from ._implicit import implicit, retract_camera
-
-Components = tuple[Array, ...]
-
-
-def _difference(a: Vector3, b: Vector3) -> Vector3:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-def _squared(a: Vector3) -> Array:
-    return dot3(a, a)
-
-
-def _floor(x: Array) -> float:
-    """Smallest number that survives being squared and inverted."""
-    return float(jnp.finfo(x.dtype).tiny) ** 0.25
-
-
-def _sign(x: Array) -> Array:
-    return jnp.where(x < 0, -1.0, 1.0).astype(x.dtype)
+from ._components import (
+    Components,
+    complement,
+    difference,
+    floor,
+    quaternion_from_rotation,
+    rotate,
+    sign,
+    squared,
+)
+from ._implicit import implicit, perturb_camera
+from ._lanes import lanes_last
 
 
 def _cube_root_guess(x: Array) -> Array:
@@ -63,13 +54,13 @@ def _isolated_root(c: Components, newton_steps: int) -> tuple[Array, Array]:
     closer than 3 sqrt(q) to the others, so that Newton's iteration is well behaved there; an infinite g (c3 = 0) is an
     ordinary case.
     """
-    size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3]) + _floor(c[0]) ** 2
+    size = jnp.abs(c[0]) + jnp.abs(c[1]) + jnp.abs(c[2]) + jnp.abs(c[3]) + floor(c[0]) ** 2
     c0, c1, c2, c3 = (x / size for x in c)
     q = c2 * c2 - 3.0 * c1 * c3
     r = c2 * (4.5 * c1 * c3 - c2 * c2) - 13.5 * c0 * c3 * c3
-    sign, r = _sign(r), jnp.abs(r)
+    side, r = sign(r), jnp.abs(r)
     discriminant = r * r - q * q * q
-    tiny = _floor(r) ** 2
+    tiny = floor(r) ** 2
     # Cardano where there is one real root; between three, 2 sqrt(q) cos(acos(w) / 3) is nearly linear in w = r / q^1.5.
     root = _cube_root_guess(r + jnp.sqrt(jnp.maximum(discriminant, 0.0)) + tiny)
     sqrt_q = jnp.sqrt(jnp.maximum(q, 0.0))
@@ -81,7 +72,7 @@ def _isolated_root(c: Components, newton_steps: int) -> tuple[Array, Array]:
         return t - (t * (t * t - 3.0 * q) - 2.0 * r) / jnp.where(slope > tiny, slope, 1.0)
 
     t = jax.lax.fori_loop(0, newton_steps, newton, t)
-    return 3.0 * c3, sign * t - c2
+    return 3.0 * c3, side * t - c2
 
 
 def _law_of_cosines(d: Components, k: Components, a: Components) -> Components:
@@ -99,7 +90,7 @@ def _newton_depths(d: Components, k: Components, a: Components) -> Components:
     j10, j12 = 2.0 * d02 + k[1] * d[2], k[1] * d[0] - 2.0 * d02
     j21, j22 = 2.0 * d12 + k[2] * d[2], k[2] * d[1] - 2.0 * d12
     determinant = j00 * j12 * j21 + j01 * j10 * j22
-    usable = jnp.abs(determinant) > _floor(determinant) ** 2
+    usable = jnp.abs(determinant) > floor(determinant) ** 2
     determinant = jnp.where(usable, determinant, jnp.inf)
     s0 = (j12 * j21 * r0 + j01 * j22 * r1 - j01 * j12 * r2) / determinant
     s1 = (j10 * j22 * r0 - j00 * j22 * r1 + j00 * j12 * r2) / determinant
@@ -109,7 +100,7 @@ def _newton_depths(d: Components, k: Components, a: Components) -> Components:
 
 def _depths(k: Components, a: Components, newton_steps: int) -> Components:
     """Four candidate triples of depths, up to rounding; complex solutions give something finite."""
-    eps_floor = _floor(k[0])
+    eps_floor = floor(k[0])
     # s_ij = sin^2 of the angle between bearings, scaled; the determinant is linear in (s, 1 - c01 c02 c12).
     h = tuple(0.5 * x for x in k)
     s = tuple(x * (2.0 - x) for x in h)
@@ -159,13 +150,9 @@ def _depths(k: Components, a: Components, newton_steps: int) -> Components:
         jnp.where(use2, last, jnp.where(use1, middle, first))
         for first, middle, last in ((a00, a01, a02), (a01, a11, a12), (a02, a12, a22))
     )
-    norm = jnp.sqrt(_squared(v) + eps_floor * eps_floor)
+    norm = jnp.sqrt(squared(v) + eps_floor * eps_floor)
     x, y, z = (component / norm for component in v)
-    # Orthonormal complement of v (Duff et al. 2017).
-    sign = _sign(z)
-    p = -1.0 / (sign + z)
-    pxy = x * y * p
-    basis = ((x, y, z), (1.0 + sign * x * x * p, sign * pxy, -sign * x), (pxy, sign + y * y * p, -y))
+    basis = ((x, y, z), *complement((x, y, z)))
 
     def forms(first: Vector3, second: Vector3) -> tuple[Array, Array]:
         values = tuple(
@@ -184,7 +171,7 @@ def _depths(k: Components, a: Components, newton_steps: int) -> Components:
     def quadratic(qa: Array, qb: Array, qc: Array) -> tuple[Array, Array]:
         """Roots (x, y) of qa y^2 + 2 qb x y + qc x^2 on a new leading axis, real parts where they are complex."""
         root = jnp.sqrt(jnp.maximum(qb * qb - qa * qc, 0.0))
-        half = -(qb + _sign(qb) * root)
+        half = -(qb + sign(qb) * root)
         first = jnp.arange(2).reshape((2,) + (1,) * qa.ndim) == 0
         x, y = (jnp.where(first, p[None], q[None]) for p, q in ((qa, half), (half, qc)))
         size = jnp.abs(x) + jnp.abs(y) + eps_floor * eps_floor
@@ -202,37 +189,8 @@ def _depths(k: Components, a: Components, newton_steps: int) -> Components:
     # The sum of the three equations (1) sets the scale: a positive definite form, and the distances sum to one.
     form = d01 * d01 + d02 * d02 + d12 * d12
     form = form + k[0][None] * d[0] * d[1] + k[1][None] * d[0] * d[2] + k[2][None] * d[1] * d[2]
-    size = _sign(d[0] + d[1] + d[2]) * jnp.sqrt(jnp.maximum(form, _floor(form) ** 3))
+    size = sign(d[0] + d[1] + d[2]) * jnp.sqrt(jnp.maximum(form, floor(form) ** 3))
     return tuple(x / size for x in d)
-
-
-def _rotate(q: Components, x: Vector3) -> Vector3:
-    axis = (q[1], q[2], q[3])
-    c = cross3(axis, x)
-    c = (2.0 * c[0], 2.0 * c[1], 2.0 * c[2])
-    s = cross3(axis, c)
-    return tuple(x[i] + q[0] * c[i] + s[i] for i in range(3))
-
-
-def _quaternion(r: list[Vector3]) -> Components:
-    """Unit quaternion nearest to a matrix `r[row][column]` that is a rotation up to rounding (Shepperd)."""
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = r
-    # Columns of 4 q q^T; the one with the largest diagonal entry is safe to normalise.
-    w, x, y, z = r21 - r12, r02 - r20, r10 - r01, None
-    columns = (
-        (1.0 + r00 + r11 + r22, w, x, y),
-        (w, 1.0 + r00 - r11 - r22, r01 + r10, r02 + r20),
-        (x, r01 + r10, 1.0 - r00 + r11 - r22, r12 + r21),
-        (y, r02 + r20, r12 + r21, 1.0 - r00 - r11 + r22),
-    )
-    first = columns[0][0] > columns[1][1]
-    second = columns[2][2] > columns[3][3]
-    left = tuple(jnp.where(first, columns[0][i], columns[1][i]) for i in range(4))
-    right = tuple(jnp.where(second, columns[2][i], columns[3][i]) for i in range(4))
-    better = jnp.where(first, columns[0][0], columns[1][1]) > jnp.where(second, columns[2][2], columns[3][3])
-    q = tuple(jnp.where(better, left[i], right[i]) for i in range(4))
-    norm = jnp.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return tuple(c / norm for c in q)
 
 
 def p3p_components(
@@ -244,22 +202,27 @@ def p3p_components(
     eps = float(jnp.finfo(dtype).eps)
     x0, x1, x2 = points
     f = []
+    proper = jnp.ones_like(x0[0], dtype=bool)
     for bearing in bearings:
-        norm2 = _squared(bearing)
-        inverse = jax.lax.rsqrt(jnp.maximum(norm2, _floor(norm2) ** 2))
+        norm2 = squared(bearing)
+        proper = proper & (norm2 > floor(norm2) ** 2) & (norm2 < 1.0 / floor(norm2) ** 2)
+        inverse = jax.lax.rsqrt(jnp.where(norm2 > floor(norm2) ** 2, norm2, 1.0))
         f.append(tuple(c * inverse for c in bearing))
-    f01, f02, f12 = _difference(f[0], f[1]), _difference(f[0], f[2]), _difference(f[1], f[2])
-    k = tuple(jnp.sqrt(_squared(x)) for x in (f01, f02, f12))
+    f01, f02, f12 = difference(f[0], f[1]), difference(f[0], f[2]), difference(f[1], f[2])
+    # Squared roots look idle, but XLA keeps a root for its consumers and recomputes a product in each of them.
+    k = tuple(jnp.sqrt(squared(x)) for x in (f01, f02, f12))
     k = tuple(x * x for x in k)
-    edge1, edge2, edge12 = _difference(x1, x0), _difference(x2, x0), _difference(x2, x1)
-    a = (_squared(edge1), _squared(edge2), _squared(edge12))
-    total = jnp.maximum(a[0] + a[1] + a[2], _floor(a[0]) ** 3)
+    edge1, edge2, edge12 = difference(x1, x0), difference(x2, x0), difference(x2, x1)
+    a = (squared(edge1), squared(edge2), squared(edge12))
+    total = jnp.maximum(a[0] + a[1] + a[2], floor(a[0]) ** 3)
     unit = tuple(x / total for x in a)
     length = jnp.sqrt(total)
 
     normal = cross3(edge1, edge2)
-    area = jnp.sqrt(_squared(normal))
-    proper = (area > 1e1 * eps * total) & (jnp.isfinite(total))
+    area = jnp.sqrt(squared(normal))
+    # Collinear to rounding: of the products, or of the coordinates far from the origin.
+    reach = length + jnp.abs(x0[0]) + jnp.abs(x0[1]) + jnp.abs(x0[2])
+    proper = proper & (area > 10.0 * eps * length * reach) & jnp.isfinite(area)
     frame3 = tuple(c / jnp.where(proper, area, 1.0) for c in normal)
     edge = jnp.sqrt(jnp.where(proper, a[0], 1.0))
     frame1 = tuple(c / edge for c in edge1)
@@ -282,22 +245,21 @@ def p3p_components(
             gap = sum(jnp.abs(c[later] - c[earlier]) for c in d)
             twice = twice | (ok[earlier] & (gap < 0.5 * eps**0.5 * largest[earlier]))
         ok = ok & ~((jnp.arange(4) == later).reshape((4,) + (1,) * twice.ndim) & twice[None])
-    d = tuple(c * length[None] for c in d)
+    # The rotation takes the orthonormal frame of the triangle to that of its image.
     y = [tuple(d[i] * c[None] for c in f[i]) for i in range(3)]
-    image1, image2 = _difference(y[1], y[0]), _difference(y[2], y[0])
+    image1, image2 = difference(y[1], y[0]), difference(y[2], y[0])
     image3 = cross3(image1, image2)
-    norm1 = jnp.sqrt(jnp.maximum(_squared(image1), _floor(length)**3))
-    norm3 = jnp.sqrt(jnp.maximum(_squared(image3), _floor(length)**3))
+    norm1, norm3 = (jnp.sqrt(jnp.maximum(squared(x), floor(length) ** 3)) for x in (image1, image3))
     image1 = tuple(c / norm1 for c in image1)
     image3 = tuple(c / norm3 for c in image3)
     image2 = cross3(image3, image1)
-    rotation = [
+    rotation = tuple(
         tuple(image1[i] * frame1[j][None] + image2[i] * frame2[j][None] + image3[i] * frame3[j][None] for j in range(3))
         for i in range(3)
-    ]
-    quaternion = _quaternion(rotation)
-    moved = _rotate(quaternion, tuple(c[None] for c in x0))
-    model = (*quaternion, y[0][0] - moved[0], y[0][1] - moved[1], y[0][2] - moved[2])
+    )
+    quaternion = quaternion_from_rotation(rotation)
+    moved = rotate(quaternion, tuple(c[None] for c in x0))
+    model = (*quaternion, *(length[None] * y[0][i] - moved[i] for i in range(3)))
     for c in model[4:]:
         ok = ok & jnp.isfinite(c)
     return tuple(jnp.where(ok, c, 1.0 if i == 0 else 0.0) for i, c in enumerate(model)), ok
@@ -313,21 +275,7 @@ def p3p_lanes(points_world: Array, bearings: Array) -> tuple[Array, Array]:
     return jnp.stack(model, axis=1), valid
 
 
-@custom_vmap
-def _solve(points_world: Array, bearings: Array) -> tuple[Array, Array]:
-    return p3p_lanes(points_world, bearings)
-
-
-@_solve.def_vmap
-def _(axis_size: int, batched: list[bool], *arrays: Array) -> tuple[tuple[Array, Array], tuple[bool, bool]]:
-    # The batching of `stack` would move the batch to the front and cost the lanes; these transpositions cancel
-    # against those of `vmap(..., in_axes=-1, out_axes=-1)`.
-    last = [
-        jnp.moveaxis(x, 0, -1) if is_batched else jnp.broadcast_to(x[..., None], (*x.shape, axis_size))
-        for x, is_batched in zip(arrays, batched, strict=True)
-    ]
-    models, valid = p3p_lanes(*last)
-    return (jnp.moveaxis(models, -1, 0), jnp.moveaxis(valid, -1, 0)), (True, True)
+_solve = lanes_last(p3p_lanes)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[SE3]:
@@ -340,16 +288,13 @@ def _collinearity(cam_from_world: SE3, data: tuple[Array, Array]) -> Array:
     points_world, bearings = data
     directions = normalize(bearings)
     # Any basis of the tangent plane gives the same derivative at a solution, so that of the bearing is held fixed.
-    x, y, z = jnp.moveaxis(jax.lax.stop_gradient(directions), -1, 0)
-    sign = _sign(z)
-    p = -1.0 / (sign + z)
-    first = jnp.stack([1.0 + sign * x * x * p, sign * x * y * p, -sign * x], axis=-1)
-    second = jnp.stack([x * y * p, sign + y * y * p, -y], axis=-1)
+    held = jax.lax.stop_gradient(directions)
+    tangents = complement((held[:, 0], held[:, 1], held[:, 2]))
     error = normalize(cam_from_world @ points_world) - directions
-    return jnp.concatenate([jnp.sum(first * error, axis=-1), jnp.sum(second * error, axis=-1)])
+    return jnp.concatenate([jnp.sum(jnp.stack(tangent, axis=-1) * error, axis=-1) for tangent in tangents])
 
 
-_p3p = implicit(_candidates, _collinearity, retract_camera, 6)
+_p3p = implicit(_candidates, _collinearity, perturb_camera, 6)
 
 
 def p3p(points_world: Float[ArrayLike, "3 3"], bearings: Float[ArrayLike, "3 3"]) -> Candidates[SE3]:
@@ -366,10 +311,12 @@ def p3p(points_world: Float[ArrayLike, "3 3"], bearings: Float[ArrayLike, "3 3"]
         (positive distance along their bearing) and satisfy the law of cosines to rounding; the others hold the
         identity.
 
-    Degenerate input: collinear or coincident points, equal or zero bearings and anything not finite leave no slot
-        valid. Near the danger cylinder two solutions merge: they are found to the square root of the precision.
+    Degenerate input: collinear or coincident points, zero bearings and anything not finite leave no slot valid. Near
+        the danger cylinder two solutions merge: they are found to the square root of the precision, or as one.
+
     Differentiability: both modes, any order, by the implicit function theorem; zero for slots that are not valid and
         at double roots.
+
     References: see the module.
 
     Example:

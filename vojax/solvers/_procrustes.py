@@ -18,8 +18,8 @@ from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
-from ._components import Components, Rows3, difference, floor, quaternion_from_rotation, rotate, squared
-from ._implicit import implicit, retract_camera
+from ._components import Components, Rows3, difference, quaternion_from_rotation, rotate, squared
+from ._implicit import implicit, perturb_camera
 from ._lanes import lanes_last
 from ._svd3 import svd3
 
@@ -44,6 +44,7 @@ def procrustes(
         slot invalid with the identity in it.
     Differentiability: both modes, any order, in points and weights, by the implicit function theorem; exact where
         singular values coincide. Zero for an invalid slot.
+
     Raises:
         ValueError: If there are fewer than three points or the arrays do not match.
     References: see the module.
@@ -61,7 +62,9 @@ def correspondences(points0: ArrayLike, points1: ArrayLike, weights: ArrayLike |
     """Arrays of one dtype, weights filled in; refuses sets no 3-D alignment can use."""
     points0, points1 = jnp.asarray(points0), jnp.asarray(points1)
     if points0.shape != points1.shape:
-        raise ValueError(f"found points of shapes {points0.shape} and {points1.shape}; expected two equal shapes [n, 3]")
+        raise ValueError(
+            f"found points of shapes {points0.shape} and {points1.shape}; expected two equal shapes [n, 3]"
+        )
     if points0.shape[0] < 3:
         raise ValueError(f"found {points0.shape[0]} points; expected at least 3 to align two point sets")
     weights = jnp.ones(points0.shape[:1], points0.dtype) if weights is None else jnp.asarray(weights)
@@ -86,9 +89,7 @@ def alignment_kernel(with_scale: bool) -> Callable[..., tuple[Array, Array]]:
         base0, base1 = _vector(points0[0]), _vector(points1[0])
         x, offset0 = _centre(points0, base0, weights, total)
         y, offset1 = _centre(points1, base1, weights, total)
-        columns = tuple(
-            tuple(jnp.sum(weights * y[i] * x[j], axis=0) for j in range(3)) for i in range(3)
-        )
+        columns = tuple(tuple(jnp.sum(weights * y[i] * x[j], axis=0) for j in range(3)) for i in range(3))
         matrix: Rows3 = tuple(tuple(jnp.where(usable, entry, 0.0) for entry in row) for row in columns)
         u, s, v = svd3(matrix)
         rotation: Rows3 = tuple(
@@ -149,4 +150,4 @@ def _candidates(data: Correspondences) -> Candidates[SE3]:
     return Candidates(models=SE3(models), valid=valid)
 
 
-_procrustes = implicit(_candidates, _stationarity, retract_camera, 6)
+_procrustes = implicit(_candidates, _stationarity, perturb_camera, 6)

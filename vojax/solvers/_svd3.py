@@ -37,7 +37,7 @@ def svd3(matrix: Rows3) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
     a = tuple((matrix[0][j] / scale, matrix[1][j] / scale, matrix[2][j] / scale) for j in range(3))
     v = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
-    def sweep(_: int, columns: tuple[Rows3, Rows3]) -> tuple[Rows3, Rows3]:
+    def sweep(_: object, columns: tuple[Rows3, Rows3]) -> tuple[Rows3, Rows3]:
         a, v = (list(c) for c in columns)
         for p, q in ((0, 1), (0, 2), (1, 2)):
             gamma = 2.0 * dot3(a[p], a[q])
@@ -49,8 +49,16 @@ def svd3(matrix: Rows3) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
             sine = tangent * cosine
             for c in (a, v):
                 c[p], c[q] = (
-                    (cosine * c[p][0] - sine * c[q][0], cosine * c[p][1] - sine * c[q][1], cosine * c[p][2] - sine * c[q][2]),
-                    (sine * c[p][0] + cosine * c[q][0], sine * c[p][1] + cosine * c[q][1], sine * c[p][2] + cosine * c[q][2]),
+                    (
+                        cosine * c[p][0] - sine * c[q][0],
+                        cosine * c[p][1] - sine * c[q][1],
+                        cosine * c[p][2] - sine * c[q][2],
+                    ),
+                    (
+                        sine * c[p][0] + cosine * c[q][0],
+                        sine * c[p][1] + cosine * c[q][1],
+                        sine * c[p][2] + cosine * c[q][2],
+                    ),
                 )
         return (a[0], a[1], a[2]), (v[0], v[1], v[2])
 

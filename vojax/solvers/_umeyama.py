@@ -13,7 +13,7 @@ from vojax._types import Array, ArrayLike, Float
 from vojax.lie import Sim3
 
 from ._candidates import Candidates
-from ._implicit import implicit, retract_camera
+from ._implicit import implicit, perturb_camera
 from ._lanes import lanes_last
 from ._procrustes import Correspondences, alignment_kernel, centred, correspondences
 
@@ -36,6 +36,7 @@ def umeyama(
     Degenerate input: as `procrustes`; `points1` all coincident leave the slot invalid too, rather than scale zero.
     Differentiability: both modes, any order, in points and weights, by the implicit function theorem; exact where
         singular values coincide. Zero for an invalid slot.
+
     Raises:
         ValueError: If there are fewer than three points or the arrays do not match.
     References: see the module.
@@ -66,4 +67,4 @@ def _candidates(data: Correspondences) -> Candidates[Sim3]:
     return Candidates(models=Sim3(models), valid=valid)
 
 
-_umeyama = implicit(_candidates, _stationarity, retract_camera, 7)
+_umeyama = implicit(_candidates, _stationarity, perturb_camera, 7)

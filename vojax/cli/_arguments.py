@@ -1,0 +1,136 @@
+"""What each command takes, and how a wrong argument is reported."""
+
+import contextlib
+import dataclasses
+import io
+import pathlib
+import re
+from typing import Annotated, Literal
+
+import tyro
+
+_DESCRIPTION = "Visual odometry in JAX. `vojax COMMAND --help` explains a command, `vojax --version` says the version."
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Estimate the path of a stereo camera through a street that vojax renders itself."""
+
+    out: pathlib.Path = pathlib.Path("vojax-demo")
+    """Folder for the results; made where it does not exist."""
+    frames: Annotated[int, tyro.conf.arg(metavar="N")] = 48
+    """Length of the sequence."""
+    window: bool = True
+    """Adjust the last keyframes together."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Of the street and of the random sampling; the same seed gives the same path."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Estimate the path of a camera from a recorded sequence, and compare it with the truth where that is known."""
+
+    path: Annotated[pathlib.Path, tyro.conf.Positional]
+    """Folder of the data set."""
+    dataset: Literal["kitti"]
+    """Layout of that folder."""
+    pipeline: Annotated[str, tyro.conf.arg(metavar="NAME")]
+    """How to estimate: stereo-3d2d."""
+    out: pathlib.Path
+    """Folder for the results; made where it does not exist."""
+    sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Sequence of the data set, such as 06."""
+    window: bool = True
+    """Adjust the last keyframes together."""
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Stop after this many frames."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Of the random sampling; the same seed and images give the same path."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Measure an estimated trajectory against the true one."""
+
+    est: Annotated[pathlib.Path, tyro.conf.Positional]
+    """Estimated trajectory."""
+    truth: Annotated[pathlib.Path, tyro.conf.Positional]
+    """True trajectory, metres."""
+    format: Literal["tum", "kitti"]
+    """Of both files: `t x y z qx qy qz qw`, matched by time, or the 3x4 pose, matched by line."""
+    alignment: Literal["none", "se3", "sim3"] = "none"
+    """Transform of the estimate that is fitted to the truth first: none, rigid or similarity."""
+    origin: Literal["identity", "given"] = "identity"
+    """`identity`: both start at the identity, as in metrics.json; `given`: compared as they are, as evo does."""
+    max_difference_s: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 0.01
+    """Poses match up to this difference of their times."""
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the metrics to this file too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Help:
+    """The user asked for help and has read it."""
+
+
+Command = Demo | Run | Eval
+_Choice = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+)
+
+
+def parse(arguments: list[str]) -> Command | Help:
+    """Turn arguments into a command; help is printed here.
+
+    Raises:
+        ValueError: An argument is unknown, missing or of the wrong kind; the message is one line.
+    """
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            # Typed loosely: a union of annotated types is no type to the checker.
+            command: Command = tyro.cli(  # type: ignore[assignment]
+                _Choice, prog="vojax", description=_DESCRIPTION, args=arguments or ["--help"]
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            return Help()
+        known = ("demo", "run", "eval")
+        command_name = arguments[0] if arguments and arguments[0] in known else ""
+        message = _one_line(box.getvalue()) or "these arguments make no sense"
+        raise ValueError(f"{message}; see {' '.join(f'vojax {command_name}'.split())} --help") from None
+    return command
+
+
+def _one_line(box: str) -> str:
+    """Take what matters from tyro's framed message.
+
+    Its first section says what is wrong; indented by four it lists names, by eight their help. A later one may hold the
+    names that the user could have meant.
+    """
+    sections: list[list[str]] = [[]]
+    for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines():
+        line = line.strip()
+        if line[:1] in ("╭", "╰", "+") or not line:
+            continue
+        inner = line.strip("│|").removeprefix(" ").rstrip()
+        if inner and not inner.strip("─-"):
+            sections.append([])
+        elif inner:
+            sections[-1].append(inner)
+    said = [line for line in sections[0] if not line.startswith(" ")]
+    names = [line.strip() for line in sections[0] if re.match(r" {4}\S", line)]
+    message = re.sub(r"\s*Got errors:.*", "", " ".join(said)).rstrip(" .:")
+    message = re.sub(r"no type matching (\S+) could be instantiated from \[(.*)\]", r"found \2, expected \1", message)
+    message = re.sub(r"\{None\}\|", "", message)
+    if names:
+        message = f"{message}: {', '.join(names)}"
+    for section in sections[1:]:
+        if section and section[0].startswith("Perhaps you meant"):
+            close = [line.strip() for line in section[1:] if re.match(r" {4}\S", line)]
+            message += f"; did you mean {' or '.join(close)}?" if close else ""
+        elif section and section[0].startswith("Available subcommands"):
+            message += f"; {' '.join(section)[:1].lower()}{' '.join(section)[1:]}"
+    return message[:1].lower() + message[1:]

@@ -1,0 +1,74 @@
+"""Entry point of the `vojax` command: whatever a user can get wrong ends in one line and exit status 2."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from vojax._version import __version__
+
+from . import _timing as _timing  # first: the clock of `first_pose_seconds` starts with the process
+
+_USAGE_ERROR = 2
+_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+_EXTRAS = {"cv2": "features", "matplotlib": "viz", "tyro": "cli", "rich": "cli"}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: Arguments after the program's name; those of the process where it is None.
+
+    Returns:
+        Exit status: 0, 2 after an error that the user can mend (one line on stderr), 130 after Ctrl-C. With
+        `VOJAX_TRACEBACK=1` in the environment errors are raised instead.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _dispatch(arguments)
+    except KeyboardInterrupt as stop:
+        _say(f"interrupted{f': {stop}' if str(stop) else ''}")
+        return _INTERRUPTED
+    except (ValueError, OSError, ImportError) as error:
+        sentence = _sentence(error)
+        if sentence is None or os.environ.get("VOJAX_TRACEBACK") == "1":
+            raise
+        _say(f"error: {sentence}")
+        return _USAGE_ERROR
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if arguments == ["--version"]:
+        print(f"vojax {__version__}")
+        return 0
+    from ._arguments import Demo, Help, Run, parse
+
+    command = parse(arguments)
+    if isinstance(command, Help):
+        return 0
+    # The command's own module, and with it JAX, OpenCV and matplotlib, comes only now: help stays fast.
+    module = {Demo: "_demo_command", Run: "_run_command"}.get(type(command), "_eval_command")
+    importlib.import_module(f"vojax.cli.{module}").execute(command)
+    return 0
+
+
+def _sentence(error: Exception) -> str | None:
+    """The error in one line, or None where it is no fault of the user's."""
+    if isinstance(error, ImportError):
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if isinstance(error, ModuleNotFoundError) and extra is not None:
+            return f"the package {error.name!r} is not installed, and this command needs it: pip install 'vojax[cli]'"
+        return _flat(str(error)) if "pip install" in str(error) else None
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{_flat(str(error.filename))}: {error.strerror}; check the path and its permissions"
+    return _flat(str(error)) or type(error).__name__
+
+
+def _flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _say(line: str) -> None:
+    sys.stdout.flush()
+    print(f"vojax: {line}", file=sys.stderr, flush=True)
