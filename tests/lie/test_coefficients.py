@@ -4,7 +4,6 @@ from math import factorial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from vojax.lie._coefficients import half_angle_over_sine, similarity_coefficients, stumpff
 
@@ -46,16 +45,15 @@ def test_half_angle_over_sine(dtype):
     np.testing.assert_allclose(np.asarray(found), 2 * half / n, rtol=16 * float(jnp.finfo(dtype).eps))
 
 
-@pytest.mark.parametrize("sigma", [0.0, 1e-12, -1e-4, 0.7, -1.999, 2.001, -6.0, 9.0])
-def test_similarity_coefficients_against_quadrature(x64, sigma):
-    u = SQUARED_ANGLES
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    tau, weights = (nodes[:, None] + 1) / 2, weights[:, None] / 2
-    growth = weights * np.exp(sigma * tau)
-    s1 = np.array([[exact_stumpff(t * t * v, 1) for v in u] for t in tau[:, 0]])
-    s2 = np.array([[exact_stumpff(t * t * v, 2) for v in u] for t in tau[:, 0]])
-    expected = np.stack(
-        [np.broadcast_to(growth.sum(), u.shape), (growth * tau * s1).sum(0), (growth * tau**2 * s2).sum(0)]
-    )
-    found = jax.jit(similarity_coefficients)(jnp.full(u.shape, sigma), jnp.asarray(u))
-    np.testing.assert_allclose(np.stack(found), expected, rtol=2e-14, atol=1e-15)
+def test_similarity_coefficients_against_quadrature(x64):
+    sigmas = np.array([0.0, 1e-12, -1e-4, 0.7, -1.999, 2.001, -6.0, 9.0])
+    u = SQUARED_ANGLES[::4]
+    nodes, weights = np.polynomial.legendre.leggauss(30)
+    tau, weights = (nodes + 1) / 2, weights / 2
+    growth = weights * np.exp(sigmas[:, None] * tau)
+    s1 = np.array([[exact_stumpff(t * t * v, 1) for v in u] for t in tau])
+    s2 = np.array([[exact_stumpff(t * t * v, 2) for v in u] for t in tau])
+    expected = [growth.sum(1, keepdims=True) * np.ones_like(u), (growth * tau) @ s1, (growth * tau**2) @ s2]
+    grid = np.broadcast_arrays(sigmas[:, None], u[None])
+    found = jax.jit(similarity_coefficients)(*(jnp.asarray(values) for values in grid))
+    np.testing.assert_allclose(np.stack(found), np.stack(expected), rtol=2e-14, atol=1e-15)

@@ -8,6 +8,7 @@ from ._losses import Squared as Squared
 from ._losses import mad_scale as mad_scale
 from ._losses import robustify as robustify
 from ._refinement import Refinement as Refinement
+from ._refinement import polish_absolute_pose as polish_absolute_pose
 from ._refinement import refine_absolute_pose as refine_absolute_pose
 from ._window import Window as Window
 from ._window import adjust_window as adjust_window

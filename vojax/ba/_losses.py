@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from vojax._numerics import safe_sqrt
-from vojax._types import Array, Float
+from vojax._types import Array, ArrayLike, Bool, Float
 
 
 @runtime_checkable
@@ -145,7 +145,7 @@ def robustify(residual: tuple[Array, ...], loss: Loss, weight: Array | None = No
     return residual if scaled is None else tuple(component * scaled for component in residual)
 
 
-def mad_scale(residuals: Float[Array, " n"], mask: Array | None = None) -> Float[Array, ""]:
+def mad_scale(residuals: Float[ArrayLike, " n"], mask: Bool[ArrayLike, " n"] | None = None) -> Float[Array, ""]:
     """Estimate a standard deviation from scalar residuals by their median absolute deviation, times 1.4826.
 
     Args:

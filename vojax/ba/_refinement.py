@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 
-from vojax._numerics import symmetric_inverse
+from vojax._numerics import cholesky_solve, symmetric_inverse
 from vojax._result import Result
 from vojax._types import Array, ArrayLike, Bool, Float, Int
 from vojax.lie import SE3
@@ -60,7 +60,7 @@ def refine_absolute_pose(
     sigma_px: Float[ArrayLike, "..."] | float = 1.0,
     mask: Bool[ArrayLike, " n"] | None = None,
     weights: Float[ArrayLike, " n"] | None = None,
-    loss: Loss = Squared(),  # noqa: B008 - frozen
+    loss: Loss = Squared(),
     options: LMOptions = LMOptions(),
 ) -> Refinement:
     """Refine a camera pose by Levenberg–Marquardt on the reprojection error.
@@ -103,6 +103,39 @@ def refine_absolute_pose(
     result = Result.where(converged, Result.success, Result.not_converged)
     result = Result.where(regular, result, Result.degenerate)
     return Refinement(model, jnp.where(regular, covariance, 0.0), cost, iterations, result)
+
+
+def polish_absolute_pose(
+    cam_from_world: SE3,
+    points_world: Float[ArrayLike, "n 3"],
+    measurements: Float[ArrayLike, "n d"],
+    camera: Any,
+    *,
+    sigma_px: Float[ArrayLike, "..."] | float = 1.0,
+    mask: Bool[ArrayLike, " n"] | None = None,
+    loss: Loss = Squared(),
+    steps: int = 4,
+) -> SE3:
+    """Improve a pose that is nearly right by a fixed number of Gauss–Newton steps.
+
+    For many hypotheses in lock-step: no acceptance test and no stopping rule, so it is small to compile and every lane
+    takes equally long. Whether the result is better is the caller's to check. Not meant to be differentiated; arguments
+    as `refine_absolute_pose`.
+    """
+    points_world, measurements = jnp.asarray(points_world), jnp.asarray(measurements)
+    n, d = measurements.shape
+    dtype = cam_from_world.wxyz_xyz.dtype
+    weight = None if mask is None else jnp.asarray(mask).astype(dtype)
+    data = (points_world, measurements, whitening(sigma_px, (n,), d, dtype), weight, camera)
+
+    def step(_: Any, pose: SE3) -> SE3:
+        observations, camera = _observe(pose, data)
+        moments = _accumulate(observations.points, observations, camera, loss)
+        damped = moments[:6, :6] * (1.0 + 1e-4 * jnp.eye(6, dtype=dtype))
+        increment, _ = cholesky_solve(damped, -moments[:6, 6:])
+        return (SE3.exp(-increment[:, 0]) @ pose).normalize()
+
+    return jax.lax.fori_loop(0, steps, step, cam_from_world)
 
 
 def _observe(cam_from_world: SE3, data: Any) -> tuple[_Observations, Any]:

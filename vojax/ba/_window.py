@@ -53,7 +53,7 @@ def adjust_window(
     *,
     sigma_px: Float[ArrayLike, "..."] | float = 1.0,
     fixed: Bool[ArrayLike, " c"] | None = None,
-    loss: Loss = Huber(),  # noqa: B008 - frozen
+    loss: Loss = Huber(),
     options: LMOptions = LMOptions(),
 ) -> Window:
     """Adjust keyframe poses and landmarks by Levenberg–Marquardt with landmark elimination.

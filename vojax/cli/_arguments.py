@@ -74,6 +74,7 @@ class Help:
 
 
 Command = Demo | Run | Eval
+_COMMANDS = ("demo", "run", "eval")
 _Choice = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Run, tyro.conf.subcommand("run")]
@@ -87,6 +88,10 @@ def parse(arguments: list[str]) -> Command | Help:
     Raises:
         ValueError: An argument is unknown, missing or of the wrong kind; the message is one line.
     """
+    command_name = arguments[0] if arguments else "--help"
+    if command_name not in (*_COMMANDS, "-h", "--help"):
+        kind = "option" if command_name.startswith("-") else "command"
+        raise ValueError(f"unknown {kind} {command_name!r}; expected {', '.join(_COMMANDS)}; see vojax --help")
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -97,34 +102,45 @@ def parse(arguments: list[str]) -> Command | Help:
     except SystemExit as stop:
         if not stop.code:
             return Help()
-        known = ("demo", "run", "eval")
-        command_name = arguments[0] if arguments and arguments[0] in known else ""
         message = _one_line(box.getvalue()) or "these arguments make no sense"
-        raise ValueError(f"{message}; see {' '.join(f'vojax {command_name}'.split())} --help") from None
+        raise ValueError(f"{message}; see vojax {command_name} --help") from None
     return command
 
 
-def _one_line(box: str) -> str:
-    """Take what matters from tyro's framed message.
+# The parser's phrases, and what a user can read.
+_PLAIN = (
+    (r"^Error parsing (\S+): ", r"\1: "),
+    (r"no type matching (?:\{None\}\|)?INT could be instantiated from \[(.*)\]", r"found \1, expected a whole number"),
+    (r"invalid literal for int\(\) with base 10: (.*)", r"found \1, expected a whole number"),
+    (r"could not convert string to float: (.*)", r"found \1, expected a number"),
+    (r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*?),?\)$", r"\2: found \1, expected one of \3"),
+    (r"Missing value for argument '(.*)'\. Expected 1 values?", r"\1: found nothing, expected a value"),
+)
 
-    Its first section says what is wrong; indented by four it lists names, by eight their help. A later one may hold the
-    names that the user could have meant.
+
+def _one_line(box: str) -> str:
+    """Take what matters from tyro's framed message; the frame is of spaces where the output is not UTF-8.
+
+    After the title, the first section says what is wrong; indented by four it lists names, by eight their help. A later
+    section may hold the names that the user could have meant.
     """
     sections: list[list[str]] = [[]]
-    for line in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines():
-        line = line.strip()
-        if line[:1] in ("╭", "╰", "+") or not line:
-            continue
-        inner = line.strip("│|").removeprefix(" ").rstrip()
-        if inner and not inner.strip("─-"):
+    for framed in re.sub(r"\x1b\[[0-9;]*m", "", box).splitlines():
+        line = re.sub(r"^[│ ] ?|[│ ]+$", "", framed)
+        if not line.strip("╭╮╰╯─- ") or line.startswith("╭"):
             sections.append([])
-        elif inner:
-            sections[-1].append(inner)
+        else:
+            sections[-1].append(line)
+    sections = [section for section in sections if section]
+    if "╭" not in box and len(sections) > 1:
+        sections = sections[1:]  # the title
+    if not sections:
+        return ""
     said = [line for line in sections[0] if not line.startswith(" ")]
     names = [line.strip() for line in sections[0] if re.match(r" {4}\S", line)]
     message = re.sub(r"\s*Got errors:.*", "", " ".join(said)).rstrip(" .:")
-    message = re.sub(r"no type matching (\S+) could be instantiated from \[(.*)\]", r"found \2, expected \1", message)
-    message = re.sub(r"\{None\}\|", "", message)
+    for pattern, plain in _PLAIN:
+        message = re.sub(pattern, plain, message)
     if names:
         message = f"{message}: {', '.join(names)}"
     for section in sections[1:]:

@@ -6,7 +6,7 @@ import errno
 import pathlib
 import platform
 import tempfile
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -24,13 +24,21 @@ from ._report import print_line, print_metrics, write_json
 from ._timing import FrameClock, peak_memory_mb, seconds_since_process_start
 
 
+@runtime_checkable
 class StereoSequence(Protocol):
     """A recorded or rendered stereo sequence, such as `vojax.datasets.KittiSequence`."""
 
-    name: str
-    stereo: RectifiedStereo | None
-    times: np.ndarray
-    poses: np.ndarray | None
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def stereo(self) -> RectifiedStereo | None: ...
+
+    @property
+    def times(self) -> np.ndarray: ...
+
+    @property
+    def poses(self) -> np.ndarray | None: ...
 
     def __len__(self) -> int: ...
 

@@ -133,7 +133,8 @@ def _optimum(views: _Views, direction: Array, inverse: Array, *, steps: int) -> 
         increment = increment * jnp.minimum(1.0, safe_divide(jnp.full_like(length, 0.5), length) + (length == 0))
         candidate = _move(direction, inverse, _tangent_basis(direction), increment)
         new_gram, new_gradient, new_cost = _normal_equations(views, *candidate)
-        better = new_cost < cost
+        # Rounding of the cost must not stop a step that still improves the point.
+        better = new_cost <= cost * (1.0 + 4.0 * float(jnp.finfo(cost.dtype).eps))
         return (
             jnp.where(better, candidate[0], direction),
             jnp.where(better, candidate[1], inverse),

@@ -16,7 +16,7 @@ from vojax._types import Array, Bool, Float, Int
 from vojax.ba import GemanMcClure, LMOptions, refine_absolute_pose
 from vojax.cameras import RectifiedStereo
 from vojax.lie import SE3
-from vojax.robust import RansacOptions, estimate_absolute_pose
+from vojax.robust import RansacOptions, search_absolute_pose
 
 from ._rectification import DisparityCalibration, corrected, disparity_terms
 
@@ -128,11 +128,11 @@ def stereo_motion(
     near = usable & (disparity0 > options.ransac_min_disparity_px)
     # A scene without near points still makes hypotheses from what there is.
     near = jnp.where(jnp.sum(near) >= 20, near, usable)
-    rough = estimate_absolute_pose(
-        points0, second[:, :2], stereo.camera, key=key, options=options.ransac, quality=quality, mask=near
+    rough, consensus = search_absolute_pose(
+        points0, second[:, :2], stereo.camera, near, quality, key, options.ransac
     )
-    found = rough.num_inliers > 3
-    pose = SE3(jnp.where(found, rough.model.wxyz_xyz, guess.wxyz_xyz))
+    found = jnp.sum(consensus.inliers) > 3
+    pose = SE3(jnp.where(found, rough.wxyz_xyz, guess.wxyz_xyz))
 
     sigma1 = jnp.where(features1.has_disparity, features1.sigma_disparity, _UNKNOWN_PX)
     noise0 = measurement_covariance(options.sigma_detect_px, features0.sigma_disparity)

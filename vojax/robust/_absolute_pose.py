@@ -12,11 +12,11 @@ import jax.numpy as jnp
 
 from vojax._result import Result
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
-from vojax.ba import Cauchy, LMOptions, refine_absolute_pose
+from vojax.ba import Cauchy, LMOptions, polish_absolute_pose, refine_absolute_pose
 from vojax.lie import SE3, SO3
 from vojax.solvers import p3p
 
-from ._engine import search
+from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
 
@@ -53,19 +53,18 @@ class AbsolutePoseEstimator(eqx.Module):
         return jnp.where(zc > 0, (pu - u) * (pu - u) + (pv - v) * (pv - v), jnp.inf)
 
     def polish(self, model: Float[Array, "12"], inliers: Bool[Array, " n"]) -> Float[Array, "12"]:
-        """A few steps of robust refinement."""
-        pose = _pose(model)
-        refined = refine_absolute_pose(
-            pose,
+        """A few steps of robust Gauss–Newton."""
+        refined = polish_absolute_pose(
+            _pose(model),
             self.points,
             self.pixels,
             self.camera,
             sigma_px=self.limit**0.5 / 3.0,
             mask=inliers,
             loss=Cauchy(),
-            options=LMOptions(max_steps=self.local_steps),
+            steps=self.local_steps,
         )
-        return _matrix_lanes(refined.model.wxyz_xyz)
+        return _matrix_lanes(refined.wxyz_xyz)
 
 
 def _matrix_lanes(parameters: Float[Array, "7 *lanes"]) -> Float[Array, "12 *lanes"]:
@@ -155,11 +154,58 @@ def _estimate(
     pixels = jnp.where(mask[:, None], pixels, 0.0)
     count = jnp.sum(mask)
 
-    # Hypotheses live in float32 and about the centre of the points, wherever the world's origin is.
+    # Poses are solved about the centre of the points, wherever the world's origin is.
     center = jax.lax.stop_gradient(jnp.sum(points_world, axis=0) / jnp.maximum(count, 1).astype(points_world.dtype))
     centered = jnp.where(mask[:, None], points_world - center[None], 0.0)
+    start, consensus = search_absolute_pose(centered, pixels, camera, mask, quality, key, options)
+
+    dtype = points_world.dtype
+    refined = refine_absolute_pose(
+        start,
+        centered,
+        pixels,
+        camera,
+        sigma_px=sigma_px,
+        mask=consensus.inliers,
+        options=LMOptions(max_steps=options.final_steps),
+    )
+    inliers, score = _judge(refined.model, centered, pixels, camera, mask, options)
+    num_inliers = jnp.sum(inliers)
+    result = Result.where(num_inliers > 3, refined.result, Result.no_consensus)
+    result = Result.where(count >= 4, result, Result.too_few)
+    usable = (result == Result.success) | (result == Result.not_converged)
+    shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)
+    model = refined.model @ shift
+    model = SE3(jnp.where(usable, model.wxyz_xyz, SE3.identity(dtype=dtype).wxyz_xyz))
+    return Estimate(
+        model,
+        inliers & usable,
+        jnp.where(usable, num_inliers, 0),
+        jnp.where(usable, score, count.astype(dtype)),
+        consensus.num_hypotheses,
+        jnp.where(usable, refined.covariance, 0.0),
+        result,
+    )
+
+
+def search_absolute_pose(
+    points_world: Float[Array, "n 3"],
+    pixels: Float[Array, "n 2"],
+    camera: Any,
+    mask: Bool[Array, " n"],
+    quality: Float[ArrayLike, " n"] | None,
+    key: PRNGKeyArray | Array,
+    options: RansacOptions,
+) -> tuple[SE3, Consensus]:
+    """Search a pose without the last refinement: the first half of `estimate_absolute_pose`, for use inside jit.
+
+    It runs in float32, so the points should not be far from the origin for their extent; nothing in it is differentiated.
+
+    Returns:
+        `cam_from_world` in the dtype of the points, the identity where nothing was found; and the consensus.
+    """
     local, local_pixels, local_camera = jax.tree.map(
-        lambda x: jax.lax.stop_gradient(x).astype(jnp.float32), (centered, pixels, camera)
+        lambda x: jax.lax.stop_gradient(x).astype(jnp.float32), (points_world, pixels, camera)
     )
     estimator = AbsolutePoseEstimator(
         local,
@@ -169,38 +215,9 @@ def _estimate(
         limit=options.threshold_px**2,
         local_steps=options.local_steps,
     )
-    found = search(
-        estimator, mask, None if quality is None else jax.lax.stop_gradient(jnp.asarray(quality)), key, options
-    )
-
-    dtype = points_world.dtype
-    shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)
-    start = SE3(_pose(found.model).wxyz_xyz.astype(dtype))
-    refined = refine_absolute_pose(
-        start,
-        centered,
-        pixels,
-        camera,
-        sigma_px=sigma_px,
-        mask=found.inliers,
-        options=LMOptions(max_steps=options.final_steps),
-    )
-    inliers, score = _judge(refined.model, centered, pixels, camera, mask, options)
-    num_inliers = jnp.sum(inliers)
-    result = Result.where(num_inliers > 3, refined.result, Result.no_consensus)
-    result = Result.where(count >= 4, result, Result.too_few)
-    usable = (result == Result.success) | (result == Result.not_converged)
-    model = refined.model @ shift
-    model = SE3(jnp.where(usable, model.wxyz_xyz, SE3.identity(dtype=dtype).wxyz_xyz))
-    return Estimate(
-        model,
-        inliers & usable,
-        jnp.where(usable, num_inliers, 0),
-        jnp.where(usable, score, count.astype(dtype)),
-        found.num_hypotheses,
-        jnp.where(usable, refined.covariance, 0.0),
-        result,
-    )
+    quality = None if quality is None else jax.lax.stop_gradient(jnp.asarray(quality))
+    consensus = search(estimator, mask, quality, key, options)
+    return SE3(_pose(consensus.model).wxyz_xyz.astype(points_world.dtype)), consensus
 
 
 def _judge(

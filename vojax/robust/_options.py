@@ -16,8 +16,8 @@ class RansacOptions:
         coarse_points: Observations that judge every hypothesis; all observations judge the best of them.
         survivors: Hypotheses of a chunk that all observations judge.
         top_k: Best hypotheses that local optimisation polishes.
-        local_steps: Steps of that optimisation.
-        final_steps: Most steps of the last refinement.
+        local_steps: Gauss–Newton steps of that optimisation.
+        final_steps: Most steps of the last refinement, Levenberg–Marquardt on the inliers.
     """
 
     threshold_px: float = 3.0

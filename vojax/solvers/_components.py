@@ -1,5 +1,7 @@
 """Vectors, quaternions and rotations by components: arrays of any one shape in and out."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 
 from vojax._numerics import Vector3, cross3, dot3
@@ -7,6 +9,11 @@ from vojax._types import Array
 
 Components = tuple[Array, ...]
 Rows3 = tuple[Vector3, Vector3, Vector3]
+
+
+def vector3(x: Array) -> Vector3:
+    """Components along the first axis of an array [3, *lanes]."""
+    return (x[0], x[1], x[2])
 
 
 def difference(a: Vector3, b: Vector3) -> Vector3:
@@ -50,7 +57,7 @@ def rotate(wxyz: Components, x: Vector3) -> Vector3:
     return (x[0] + wxyz[0] * c[0] + s[0], x[1] + wxyz[0] * c[1] + s[1], x[2] + wxyz[0] * c[2] + s[2])
 
 
-def quaternion_from_rotation(rotation: Rows3) -> Components:
+def quaternion_from_rotation(rotation: Sequence[Sequence[Array]]) -> Components:
     """Unit quaternion (w, x, y, z) of a matrix that is a rotation up to rounding.
 
     References: S. Shepperd. Quaternion from rotation matrix. JGCD 1978.

@@ -35,6 +35,7 @@ from ._components import (
     rotate,
     sign,
     squared,
+    vector3,
 )
 from ._implicit import implicit, perturb_camera
 from ._lanes import lanes_last
@@ -270,7 +271,7 @@ def p3p_lanes(points_world: Array, bearings: Array) -> tuple[Array, Array]:
 
     The lanes stay the innermost axes throughout, which is what a CPU vectorises over.
     """
-    points, rays = (tuple(tuple(x[i, j] for j in range(3)) for i in range(3)) for x in (points_world, bearings))
+    points, rays = ((vector3(x[0]), vector3(x[1]), vector3(x[2])) for x in (points_world, bearings))
     model, valid = p3p_components(points, rays)
     return jnp.stack(model, axis=1), valid
 

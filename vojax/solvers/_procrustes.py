@@ -13,12 +13,12 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from vojax._numerics import safe_divide
+from vojax._numerics import Vector3, safe_divide
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
-from ._components import Components, Rows3, difference, quaternion_from_rotation, rotate, squared
+from ._components import Components, difference, quaternion_from_rotation, rotate, squared, vector3
 from ._implicit import implicit, perturb_camera
 from ._lanes import lanes_last
 from ._svd3 import svd3
@@ -86,13 +86,13 @@ def alignment_kernel(with_scale: bool) -> Callable[..., tuple[Array, Array]]:
         weights = weights / largest[None]
         total = jnp.sum(weights, axis=0)
         # Relative to one of the points first, so that far from the origin the mean does not round.
-        base0, base1 = _vector(points0[0]), _vector(points1[0])
+        base0, base1 = vector3(points0[0]), vector3(points1[0])
         x, offset0 = _centre(points0, base0, weights, total)
         y, offset1 = _centre(points1, base1, weights, total)
         columns = tuple(tuple(jnp.sum(weights * y[i] * x[j], axis=0) for j in range(3)) for i in range(3))
-        matrix: Rows3 = tuple(tuple(jnp.where(usable, entry, 0.0) for entry in row) for row in columns)
+        matrix = tuple(tuple(jnp.where(usable, entry, 0.0) for entry in row) for row in columns)
         u, s, v = svd3(matrix)
-        rotation: Rows3 = tuple(
+        rotation = tuple(
             tuple(u[0][i] * v[0][j] + u[1][i] * v[1][j] + u[2][i] * v[2][j] for j in range(3)) for i in range(3)
         )
         wxyz = quaternion_from_rotation(rotation)
@@ -116,11 +116,7 @@ def alignment_kernel(with_scale: bool) -> Callable[..., tuple[Array, Array]]:
     return kernel
 
 
-def _vector(x: Array) -> tuple[Array, Array, Array]:
-    return (x[0], x[1], x[2])
-
-
-def _centre(points: Array, base: Components, weights: Array, total: Array) -> tuple[Components, Components]:
+def _centre(points: Array, base: Vector3, weights: Array, total: Array) -> tuple[Components, Components]:
     """Components [n, *lanes] relative to the weighted mean, and that mean relative to `base`."""
     relative = tuple(points[:, i] - base[i][None] for i in range(3))
     mean = tuple(jnp.sum(weights * c, axis=0) / jnp.where(total > 0, total, 1.0) for c in relative)

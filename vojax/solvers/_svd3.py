@@ -6,6 +6,8 @@ values. It keeps small singular values accurate, needs no special cases for repe
 References: G. Golub, C. Van Loan. Matrix Computations, 4th edition, section 8.6.3.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -15,7 +17,7 @@ from vojax._types import Array
 from ._components import Rows3, complement, floor, sign, squared
 
 
-def svd3(matrix: Rows3) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
+def svd3(matrix: Sequence[Sequence[Array]]) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
     """Decompose A = U diag(s) Vᵀ with rotations U and V.
 
     Args:
@@ -48,18 +50,7 @@ def svd3(matrix: Rows3) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
             cosine = 1.0 / jnp.sqrt(1.0 + tangent * tangent)
             sine = tangent * cosine
             for c in (a, v):
-                c[p], c[q] = (
-                    (
-                        cosine * c[p][0] - sine * c[q][0],
-                        cosine * c[p][1] - sine * c[q][1],
-                        cosine * c[p][2] - sine * c[q][2],
-                    ),
-                    (
-                        sine * c[p][0] + cosine * c[q][0],
-                        sine * c[p][1] + cosine * c[q][1],
-                        sine * c[p][2] + cosine * c[q][2],
-                    ),
-                )
+                c[p], c[q] = _mix(cosine, c[p], -sine, c[q]), _mix(sine, c[p], cosine, c[q])
         return (a[0], a[1], a[2]), (v[0], v[1], v[2])
 
     sweeps = 6 if scale.dtype == jnp.float64 else 5
@@ -81,6 +72,10 @@ def svd3(matrix: Rows3) -> tuple[Rows3, tuple[Array, Array, Array], Rows3]:
     u2 = cross3(u0, u1)
     s2 = dot3(a[2], u2)
     return (u0, u1, u2), (s0 * scale, s1 * scale, s2 * scale), (v[0], v[1], v[2])
+
+
+def _mix(a: Array, x: Vector3, b: Array, y: Vector3) -> Vector3:
+    return (a * x[0] + b * y[0], a * x[1] + b * y[1], a * x[2] + b * y[2])
 
 
 def _where(condition: Array, a: Vector3, b: Vector3) -> Vector3:

@@ -1,0 +1,172 @@
+"""The pipeline on rendered and on real images, and its stages on simulated measurements.
+
+One file, so that one process compiles the motion and the window once for all of them.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vojax.cameras import Pinhole, RectifiedStereo
+from vojax.datasets import KittiSequence, SyntheticStereoSequence
+from vojax.lie import SE3
+from vojax.metrics import Trajectory, evaluate
+from vojax.odometry import (
+    PIPELINES,
+    DisparityCalibration,
+    KeyframeOptions,
+    MotionOptions,
+    StereoOdometry,
+    StereoOdometryOptions,
+    is_keyframe,
+)
+from vojax.odometry._motion import StereoFeatures, stereo_motion
+
+STEREO = RectifiedStereo(Pinhole(fx=700.0, fy=700.0, cx=600.0, cy=180.0), baseline=0.54)
+SIZE = 640
+
+
+def simulated_pair(seed: int, offsets=(0.0, 0.0), noise=1.0, outliers=0.2):
+    """Features of two frames 1 m apart, padded; `offsets` is what the disparities lack."""
+    rng = np.random.default_rng(seed)
+    n = 500
+    depth = rng.uniform(5.0, 60.0, n)
+    points = np.stack([rng.uniform(-0.8, 0.8, n) * depth, rng.uniform(-0.2, 0.2, n) * depth, depth], 1)
+    motion = SE3.exp(jnp.array([0.02, -0.01, -1.0, 0.003, 0.01, -0.002]) + 0.002 * rng.normal(size=6))
+    measured = []
+    for pose in (SE3.identity(), motion):
+        m = np.array(STEREO.project(pose.apply(jnp.asarray(points, jnp.float32))))
+        x = (m[:, 0] - 600.0) / 700.0
+        m[:, 2] += offsets[0] + offsets[1] * x**2  # u_right too large: disparity too small
+        jitter = noise * rng.normal(size=(n, 3)) * [0.1, 0.1, 0.15]
+        m += jitter + jitter[:, :1] * [0, 0, 1]
+        measured.append(m)
+    wrong = rng.uniform(size=n) < outliers
+    measured[1][wrong, :2] += rng.uniform(-40, 40, (int(wrong.sum()), 2))
+
+    def padded(m):
+        full = np.zeros((SIZE, 3), np.float32)
+        full[:n] = m
+        there = jnp.arange(SIZE) < n
+        return StereoFeatures(jnp.asarray(full), jnp.full((SIZE,), 0.15), there, there)
+
+    return motion, padded(measured[0]), padded(measured[1]), wrong
+
+
+def estimate(seed, first, second, calibration=None, options=MotionOptions()):
+    calibration = DisparityCalibration.prior() if calibration is None else calibration
+    key = jax.random.key(seed)
+    return stereo_motion(first, second, jnp.ones(SIZE), SE3.identity(), calibration, STEREO, key, options)
+
+
+def test_motion_is_found_among_outliers_with_a_covariance_that_fits():
+    nees = []
+    for seed in range(12):
+        truth, first, second, wrong = simulated_pair(seed)
+        motion = estimate(seed, first, second)
+        error = np.asarray((truth @ motion.cam1_from_cam0.inverse()).log())
+        assert np.linalg.norm(error[:3]) < 0.02
+        assert np.degrees(np.linalg.norm(error[3:])) < 0.05
+        kept = np.asarray(motion.inliers)[: len(wrong)]
+        assert kept[~wrong].mean() > 0.9
+        assert kept[wrong].mean() < 0.1
+        assert not np.asarray(motion.inliers)[len(wrong) :].any()
+        nees.append(error @ np.linalg.solve(np.asarray(motion.covariance, np.float64), error))
+    # Robust weights and shared noise make the covariance approximate: six degrees of freedom within a factor of two.
+    assert 3.0 < np.mean(nees) < 12.0
+
+
+def test_disparity_error_is_calibrated_away_and_without_it_scale_is_wrong():
+    truth_offsets = np.array([0.1, 1.0])
+    calibration, plain_scale, calibrated_scale = DisparityCalibration.prior(), [], []
+    for seed in range(20):
+        truth, first, second, _ = simulated_pair(seed, truth_offsets)
+        motion = estimate(seed, first, second, calibration)
+        calibration = motion.calibration
+        length = float(jnp.linalg.norm(truth.translation()))
+        calibrated_scale.append(float(jnp.linalg.norm(motion.cam1_from_cam0.translation())) / length - 1.0)
+        plain = estimate(seed, first, second, options=MotionOptions(self_calibrate=False))
+        plain_scale.append(float(jnp.linalg.norm(plain.cam1_from_cam0.translation())) / length - 1.0)
+    np.testing.assert_allclose(calibration.estimate(), truth_offsets, atol=0.15)
+    assert np.mean(plain_scale) > 0.004
+    assert abs(np.mean(calibrated_scale[10:])) < 0.5 * np.mean(plain_scale)
+
+
+def test_nothing_to_track_leaves_the_guess_and_no_inliers():
+    _, first, second, _ = simulated_pair(0)
+    empty = StereoFeatures(first.measurements, first.sigma_disparity, first.has_position & False, first.has_disparity)
+    motion = estimate(0, empty, second)
+    assert int(motion.num_inliers) == 0
+    for leaf in jax.tree.leaves(motion):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+
+
+def test_keyframe_rule():
+    depths = np.full(100, 20.0)
+    options = KeyframeOptions(distance_over_depth=0.1, min_shared=50)
+    assert not is_keyframe(1.9, depths, 80, options)
+    assert is_keyframe(2.1, depths, 80, options)
+    assert is_keyframe(0.1, depths, 49, options)
+    assert not is_keyframe(1.0, np.zeros(0), 80, options)
+
+
+def drive(sequence, options=StereoOdometryOptions(), blank=()):
+    odometry = PIPELINES["stereo-3d2d"](sequence.stereo, options)
+    estimates = []
+    for k in range(len(sequence)):
+        left, right = sequence.images(k)
+        if k in blank:
+            left, right = np.zeros_like(left), np.zeros_like(right)
+        estimates.append(odometry.step(left, right))
+    return estimates
+
+
+def measure(sequence, estimates):
+    poses = np.tile(np.eye(4), (len(sequence), 1, 1))
+    poses[:, :3] = sequence.poses
+    return evaluate(
+        Trajectory(sequence.times, np.stack([e.world_from_cam for e in estimates])), Trajectory(sequence.times, poses)
+    )
+
+
+@pytest.fixture(scope="module")
+def street():
+    return SyntheticStereoSequence(frames=20)
+
+
+def test_rendered_street_is_followed(street):
+    estimates = drive(street)
+    metrics = measure(street, estimates)
+    assert metrics.drift_percent < 0.5
+    assert metrics.rpe_rot_deg < 0.1
+    assert not any(e.bridged for e in estimates)
+    assert sum(e.keyframe for e in estimates) >= 4
+    again = drive(street)
+    for one, other in zip(estimates, again, strict=True):
+        np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
+
+
+def test_a_blank_frame_is_bridged_counted_and_the_run_goes_on(street):
+    estimates = drive(street, blank=(9,))
+    assert [k for k, e in enumerate(estimates) if e.bridged] == [9, 10]
+    for e in estimates:
+        assert np.isfinite(e.world_from_cam).all()
+        np.testing.assert_allclose(e.world_from_cam[:3, :3] @ e.world_from_cam[:3, :3].T, np.eye(3), atol=1e-9)
+    # Two steps by the motion model cost some accuracy, not the path.
+    assert measure(street, estimates).drift_percent < 5.0
+
+
+def test_images_of_another_size_are_refused(street):
+    odometry = StereoOdometry(street.stereo)
+    odometry.step(*street.images(0))
+    with pytest.raises(ValueError, match="a sequence has one size"):
+        odometry.step(np.zeros((100, 100), np.uint8), np.zeros((100, 100), np.uint8))
+
+
+@pytest.mark.data
+def test_kitti_06_clip(data_root):
+    sequence = KittiSequence(data_root / "kitti", "06")
+    metrics = measure(sequence, drive(sequence))
+    assert metrics.drift_percent <= 0.8
+    assert metrics.ate_rmse_m <= 0.3
