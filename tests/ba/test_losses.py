@@ -118,7 +118,7 @@ def test_robustified_residual_is_differentiable_at_zero(name):
         by_all = jax.vmap(jax.grad(first, argnums=(0, 1, 2)))(u, zero, w)
         return by_all, jax.vmap(jax.grad(jax.grad(first)))(u, zero, w)
 
-    u, w = jnp.array([0.0, 1e-25, 0.0, 1e15]), jnp.array([4.0, 4.0, 0.0, 4.0])
+    u, w = jnp.array([0.0, 1e-25, 0.0, 1e8]), jnp.array([4.0, 4.0, 0.0, 4.0])
     by_all, second = derivatives(u, w)
     assert np.isfinite(by_all).all()
     assert np.isfinite(second).all()

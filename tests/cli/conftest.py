@@ -109,13 +109,21 @@ class FakeOdometry:
 
 
 @pytest.fixture
-def fake(monkeypatch):
-    """The pipeline without its computations; subclass or set attributes to make it misbehave."""
+def drawn_for_real():
+    """Ask for this to have matplotlib draw `fake`'s results; it takes a second."""
+
+
+@pytest.fixture
+def fake(request, monkeypatch):
+    """The pipeline without its computations, and pictures that only say how many poses they show."""
 
     class Fake(FakeOdometry):
         made: ClassVar[list] = []
 
     monkeypatch.setitem(vojax.odometry.PIPELINES, "stereo-3d2d", Fake)
+    if "drawn_for_real" not in request.fixturenames:
+        monkeypatch.setattr("vojax.cli._run.plot_trajectory", lambda estimate, truth, **_: f"{len(estimate)} poses")
+        monkeypatch.setattr("vojax.cli._run.save_figure", lambda figure, path: path.write_text(figure))
     return Fake
 
 

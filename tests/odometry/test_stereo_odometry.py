@@ -35,11 +35,11 @@ def simulated_pair(seed: int, offsets=(0.0, 0.0), noise=1.0, outliers=0.2):
     points = np.stack([rng.uniform(-0.8, 0.8, n) * depth, rng.uniform(-0.2, 0.2, n) * depth, depth], 1)
     motion = SE3.exp(jnp.array([0.02, -0.01, -1.0, 0.003, 0.01, -0.002]) + 0.002 * rng.normal(size=6))
     measured = []
-    for pose in (SE3.identity(), motion):
+    for pose, sigma in ((SE3.identity(), 0.1), (motion, 0.25)):  # as MotionOptions states them
         m = np.array(STEREO.project(pose.apply(jnp.asarray(points, jnp.float32))))
         x = (m[:, 0] - 600.0) / 700.0
         m[:, 2] += offsets[0] + offsets[1] * x**2  # u_right too large: disparity too small
-        jitter = noise * rng.normal(size=(n, 3)) * [0.1, 0.1, 0.15]
+        jitter = noise * rng.normal(size=(n, 3)) * [sigma, sigma, 0.15]
         m += jitter + jitter[:, :1] * [0, 0, 1]
         measured.append(m)
     wrong = rng.uniform(size=n) < outliers

@@ -37,13 +37,13 @@ class ArrowSystem(eqx.Module):
 class Reduced(eqx.Module):
     """The camera system after elimination, factored."""
 
-    factor: Float[Array, "6c 6c"]
-    scale: Float[Array, " 6c"]
+    factor: Float[Array, "d d"]
+    scale: Float[Array, " d"]
     eliminated: Float[Array, "6 3 c p"]
     landmark_inverse: Float[Array, "3 3 p"]
     regular: Bool[Array, ""]
 
-    def solve_cameras(self, rhs: Float[Array, "6c k"]) -> Float[Array, "6c k"]:
+    def solve_cameras(self, rhs: Float[Array, "d k"]) -> Float[Array, "d k"]:
         """Solve S x = rhs."""
         scaled = jax.scipy.linalg.cho_solve((self.factor, True), self.scale[:, None] * rhs)
         return self.scale[:, None] * scaled

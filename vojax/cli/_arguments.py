@@ -30,7 +30,7 @@ class Demo:
 class Run:
     """Estimate the path of a camera from a recorded sequence, and compare it with the truth where that is known."""
 
-    path: Annotated[pathlib.Path, tyro.conf.Positional]
+    path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the data set."""
     dataset: Literal["kitti"]
     """Layout of that folder."""
@@ -52,9 +52,9 @@ class Run:
 class Eval:
     """Measure an estimated trajectory against the true one."""
 
-    est: Annotated[pathlib.Path, tyro.conf.Positional]
+    est: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="EST")]
     """Estimated trajectory."""
-    truth: Annotated[pathlib.Path, tyro.conf.Positional]
+    truth: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="TRUTH")]
     """True trajectory, metres."""
     format: Literal["tum", "kitti"]
     """Of both files: `t x y z qx qy qz qw`, matched by time, or the 3x4 pose, matched by line."""
@@ -113,7 +113,10 @@ _PLAIN = (
     (r"no type matching (?:\{None\}\|)?INT could be instantiated from \[(.*)\]", r"found \1, expected a whole number"),
     (r"invalid literal for int\(\) with base 10: (.*)", r"found \1, expected a whole number"),
     (r"could not convert string to float: (.*)", r"found \1, expected a number"),
-    (r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*?),?\)$", r"\2: found \1, expected one of \3"),
+    (
+        r"invalid choice (.*) for argument '(.*)'\. Expected one of \((.*?)(?:,\s*)?\)$",
+        r"\2: found \1, expected one of \3",
+    ),
     (r"Missing value for argument '(.*)'\. Expected 1 values?", r"\1: found nothing, expected a value"),
 )
 

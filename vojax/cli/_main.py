@@ -1,6 +1,7 @@
 """Entry point of the `vojax` command: whatever a user can get wrong ends in one line and exit status 2."""
 
 import importlib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -25,6 +26,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         `VOJAX_TRACEBACK=1` in the environment errors are raised instead.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # A degree sign must not end a run where output is ASCII.
     try:
         return _dispatch(arguments)
     except KeyboardInterrupt as stop:

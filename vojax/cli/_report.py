@@ -41,15 +41,17 @@ def print_metrics(console: Console, title: str, metrics: Mapping[str, Any], by_n
         metrics: By their names in `metrics.json`.
         by_name: Label rows by these names, with all digits, instead of by words.
     """
-    table = Table(title=title, title_justify="left", title_style="bold", show_header=False)
+    table = Table(show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
     for key, label, form in _ROWS:
+        if key == "scale" and metrics.get("alignment") != "sim3":
+            continue
         if metrics.get(key) is not None:
             value = metrics[key]
-            table.add_row(key, str(value) if isinstance(value, int) else f"{value:.9g}") if by_name else table.add_row(
-                label, form.format(value)
-            )
+            exact = str(value) if isinstance(value, int) else f"{value:.9g}"
+            table.add_row(*((key, exact) if by_name else (label, form.format(value))))
+    console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
     console.print(table)
 
 

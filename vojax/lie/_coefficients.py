@@ -36,12 +36,14 @@ def stumpff(u: Float[Array, "*shape"]) -> tuple[Float[Array, "*shape"], ...]:
     Differentiability: any order, at u = 0 as well, where the series is a polynomial.
     """
     small = u < _SERIES_LIMIT
-    # Double where: each branch sees only arguments it can handle, so no gradient of the other one leaks a NaN.
-    u_small = jnp.where(small, u, 0.0)
-    u_large = jnp.where(small, _SERIES_LIMIT, u)
+    # Double where: each branch sees only arguments it can handle, so no gradient of the other one leaks a NaN. The
+    # guards overlap: XLA may evaluate u twice with different rounding (fused multiply-add), and at the limit one copy
+    # selects a branch that the other has switched off. With touching guards slopes were wrong by 8 % at u = 4.
+    u_small = jnp.where(u < 1.1 * _SERIES_LIMIT, u, 0.0)
+    u_large = jnp.where(u > 0.9 * _SERIES_LIMIT, u, _SERIES_LIMIT)
 
     s4 = s5 = jnp.zeros_like(u)
-    for k in reversed(range(_series_length(u.dtype, _SERIES_LIMIT, 2, 4))):
+    for k in reversed(range(_series_length(u.dtype, 1.1 * _SERIES_LIMIT, 2, 4))):
         s4 = 1.0 / math.factorial(2 * k + 4) - u_small * s4
         s5 = 1.0 / math.factorial(2 * k + 5) - u_small * s5
     s2, s3 = 1.0 / 2.0 - u_small * s4, 1.0 / 6.0 - u_small * s5
@@ -71,14 +73,15 @@ def half_angle_over_sine(
     # 0.2 rad) eight or seventeen terms hold full precision and the closed form's derivative loses at most 25 eps.
     squared_cosine = cosine * cosine
     small = squared_sine < 0.04 * squared_cosine
-    w = jnp.where(small, cosine, 1.0)
-    ratio = jnp.where(small, squared_sine, 0.0) / (w * w)
-    terms = next(k for k in range(1, 64) if 0.04**k / (2 * k + 1) < float(jnp.finfo(cosine.dtype).eps) / 8)
+    near = squared_sine < 0.05 * squared_cosine
+    w = jnp.where(near, cosine, 1.0)
+    ratio = jnp.where(near, squared_sine, 0.0) / (w * w)
+    terms = next(k for k in range(1, 64) if 0.05**k / (2 * k + 1) < float(jnp.finfo(cosine.dtype).eps) / 8)
     series = jnp.zeros_like(cosine)
     for k in reversed(range(terms)):
         series = 1.0 / (2 * k + 1) - ratio * series
 
-    usable = ~small & (squared_sine > 0)
+    usable = (squared_sine > 0.03 * squared_cosine) & (squared_sine > 0)
     n = jnp.sqrt(jnp.where(usable, squared_sine, 1.0))
     closed = 2.0 * jnp.arctan2(n, jnp.where(usable, cosine, 1.0)) / n
     return jnp.where(small, 2.0 * series / w, jnp.where(usable, closed, 0.0))
@@ -95,25 +98,28 @@ def similarity_coefficients(
     """
     squared_modulus = sigma * sigma + u
     small = squared_modulus < _SERIES_LIMIT
-    sigma_small, u_small = jnp.where(small, sigma, 0.0), jnp.where(small, u, 0.0)
-    axis_small = jnp.abs(sigma) < math.sqrt(_SERIES_LIMIT)
-    sigma_axis = jnp.where(axis_small, sigma, 0.0)
+    near = squared_modulus < 1.1 * _SERIES_LIMIT
+    sigma_small, u_small = jnp.where(near, sigma, 0.0), jnp.where(near, u, 0.0)
+    axis_limit = math.sqrt(_SERIES_LIMIT)
+    axis_small = jnp.abs(sigma) < axis_limit
+    sigma_axis = jnp.where(jnp.abs(sigma) < 1.1 * axis_limit, sigma, 0.0)
 
     # Powers z^k = p + iθ q and (σ^k − p) / u = r, summed with weights 1/(k+1)!; nothing is divided by σ or u.
     a = jnp.ones_like(sigma)
     b = c = jnp.zeros_like(sigma)
     power, p = jnp.ones_like(sigma), jnp.ones_like(sigma)
     q = r = jnp.zeros_like(sigma)
-    for k in range(1, _series_length(sigma.dtype, math.sqrt(_SERIES_LIMIT), 1, 1) + 2):
+    for k in range(1, _series_length(sigma.dtype, 1.1 * math.sqrt(_SERIES_LIMIT), 1, 1) + 2):
         power = power * sigma_axis
         p, q, r = sigma_small * p - u_small * q, p + sigma_small * q, sigma_small * r + q
         weight = 1.0 / math.factorial(k + 1)
         a, b, c = a + weight * power, b + weight * q, c + weight * r
 
-    sigma_far = jnp.where(axis_small, 2.0, sigma)
+    sigma_far = jnp.where(jnp.abs(sigma) > 0.9 * axis_limit, sigma, axis_limit)
     a = jnp.where(axis_small, a, jnp.expm1(sigma_far) / sigma_far)
-    modulus_far = jnp.where(small, _SERIES_LIMIT, squared_modulus)
-    growth = jnp.exp(jnp.where(small, 0.0, sigma))
+    far = squared_modulus > 0.9 * _SERIES_LIMIT
+    modulus_far = jnp.where(far, squared_modulus, _SERIES_LIMIT)
+    growth = jnp.exp(jnp.where(far, sigma, 0.0))
     c0, c1, c2, *_ = stumpff(u)
     b_far = (1.0 - growth * (c0 - sigma * c1)) / modulus_far
     c_far = (a - growth * (c1 - sigma * c2)) / modulus_far

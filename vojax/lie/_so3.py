@@ -70,8 +70,9 @@ class SO3(eqx.Module):
         quaternion gives zero.
         Differentiability: both modes, at the identity and at half a turn as well (one-sided there).
         """
-        w, x, y, z = split(self.wxyz)
-        # q and −q are the same rotation; the one with w ≥ 0 has the angle in [0, π].
+        # q and −q are the same rotation; the one with w ≥ 0 has the angle in [0, π]. The barrier makes every component
+        # see the same w: rounded differently in two places, it could have both signs at half a turn.
+        w, x, y, z = split(jax.lax.optimization_barrier(self.wxyz))
         sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
         factor = sign * half_angle_over_sine(squared_norm((x, y, z)), sign * w)
         return stack(factor * x, factor * y, factor * z)
@@ -87,7 +88,9 @@ class SO3(eqx.Module):
         Differentiability: both modes, for every rotation.
         References: Shepperd, "Quaternion from rotation matrix", 1978.
         """
-        (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = split_matrix(as_floating(matrix, 3, 3))
+        # The barrier makes all components select the same row where two are equally large.
+        matrix = jax.lax.optimization_barrier(as_floating(matrix, 3, 3))
+        (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = split_matrix(matrix)
         # Row i of 4 q qᵀ is 4 q_i q. The diagonal sums to 4, so its largest entry is at least 1 and the row is safe to
         # normalise; all four rows are formed, one is selected.
         rows = (

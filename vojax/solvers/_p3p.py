@@ -90,8 +90,10 @@ def _newton_depths(d: Components, k: Components, a: Components) -> Components:
     j00, j01 = 2.0 * d01 + k[0] * d[1], k[0] * d[0] - 2.0 * d01
     j10, j12 = 2.0 * d02 + k[1] * d[2], k[1] * d[0] - 2.0 * d02
     j21, j22 = 2.0 * d12 + k[2] * d[2], k[2] * d[1] - 2.0 * d12
-    determinant = j00 * j12 * j21 + j01 * j10 * j22
-    usable = jnp.abs(determinant) > floor(determinant) ** 2
+    first, second = j00 * j12 * j21, j01 * j10 * j22
+    determinant = first + second
+    # Within rounding of a double root the step is noise, and would throw the solution away.
+    usable = jnp.abs(determinant) > float(jnp.finfo(r0.dtype).eps) ** 0.5 * (jnp.abs(first) + jnp.abs(second))
     determinant = jnp.where(usable, determinant, jnp.inf)
     s0 = (j12 * j21 * r0 + j01 * j22 * r1 - j01 * j12 * r2) / determinant
     s1 = (j10 * j22 * r0 - j00 * j22 * r1 + j00 * j12 * r2) / determinant
@@ -237,6 +239,8 @@ def p3p_components(
     largest = jnp.maximum(jnp.maximum(d[0], d[1]), d[2])
     # Rounding of (1): of the distances themselves, and of the difference of two large depths.
     ok = proper[None] & (jnp.minimum(jnp.minimum(d[0], d[1]), d[2]) > 0)
+    # Bearings that agree to rounding put the camera at infinity.
+    ok = ok & (largest < 1.0 / (16.0 * eps)) & (k[0] + k[1] + k[2] > (16.0 * eps) ** 2)[None]
     for q in range(3):
         ok = ok & (jnp.abs(r[q]) <= 64.0 * eps * (1.0 + largest))
     # A root met twice counts once.
