@@ -1,6 +1,6 @@
 """Time per problem of 1,000 six-dof refinements of 100 points each, float32, beside stock optimistix and one C++ core.
 
-    python benchmarks/bench_refinement.py
+python benchmarks/bench_refinement.py
 """
 
 import jax
@@ -50,7 +50,8 @@ def main() -> None:
     pixels, points = np.asarray(problems.pixels[0], np.float64), np.asarray(problems.points_world[0], np.float64)
     pose = poselib.CameraPose()
     pose.q, pose.t = np.asarray(starts.wxyz_xyz[0, :4], np.float64), np.asarray(starts.wxyz_xyz[0, 4:], np.float64)
-    model = {"model": "PINHOLE", "width": 1280, "height": 960, "params": [float(p) for p in (camera.fx, camera.fy, camera.cx, camera.cy)]}
+    intrinsics = [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    model = {"model": "PINHOLE", "width": 1280, "height": 960, "params": intrinsics}
     median, best = time_calls(lambda: poselib.refine_absolute_pose(pixels, points, pose, model, {}))
     print(f"PoseLib refine_absolute_pose, one call from Python: median {median * 1e6:.1f} µs, best {best * 1e6:.1f}")
 

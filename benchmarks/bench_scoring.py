@@ -1,6 +1,6 @@
 """Residuals per second of hypothesis scoring: 4096 poses against 1024 points, float32.
 
-    python benchmarks/bench_scoring.py
+python benchmarks/bench_scoring.py
 """
 
 import jax

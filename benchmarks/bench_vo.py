@@ -1,6 +1,6 @@
 """Stereo odometry on the KITTI 06 clip: accuracy, speed, where the time goes, with and without the window.
 
-    VOJAX_DATA=… python benchmarks/bench_vo.py
+VOJAX_DATA=… python benchmarks/bench_vo.py
 """
 
 import os
@@ -47,8 +47,8 @@ def main() -> None:
         m = evaluate(trajectory(sequence.times, np.array(poses)), truth)
         rate = (len(seconds) - 10) / sum(seconds[10:])
         print(
-            f"{name:26s} {m.drift_percent:6.3f}  {m.ate_rmse_m:6.3f}  {m.rpe_trans_m:6.4f}  {m.rpe_rot_deg:6.4f}  {rate:7.1f}  "
-            f"{statistics.mean(inliers[1:]):7.0f}  {bridged:6d}"
+            f"{name:26s} {m.drift_percent:6.3f}  {m.ate_rmse_m:6.3f}  {m.rpe_trans_m:6.4f}  {m.rpe_rot_deg:6.4f}"
+            f"  {rate:7.1f}  {statistics.mean(inliers[1:]):7.0f}  {bridged:6d}"
         )
     budget(sequence)
 

@@ -62,9 +62,9 @@ def cholesky_factor(matrix: Float[Array, "d d *lanes"]) -> tuple[list[Array], li
         matrix: Symmetric matrices, batch on the trailing axes.
 
     Returns:
-        The columns of L, from the diagonal down `[d − k, *lanes]`; the inverses of its diagonal; and a mask that is False
-        where M is singular to working precision. There the offending columns and their inverses are 0, so that solutions
-        stay finite and have no component along directions without information.
+        The columns of L, from the diagonal down `[d − k, *lanes]`; the inverses of its diagonal; and a mask that is
+        False where M is singular to working precision. There the offending columns and their inverses are 0, so that
+        solutions stay finite and have no component along directions without information.
     """
     size = matrix.shape[0]
     diagonal = [matrix[k, k] for k in range(size)]

@@ -10,9 +10,8 @@ from vojax.solvers._implicit import solve_square
 def square_roots(data):
     """x² = a by a loop nobody would differentiate; the second slot is the negative root."""
     a, _ = data
-    root = jax.lax.while_loop(
-        lambda x: jnp.abs(x * x - a) > 1e-13 * a, lambda x: 0.5 * (x + a / x), jnp.maximum(a, 1.0)
-    )
+    root = jax.lax.fori_loop(0, 20, lambda _, x: 0.5 * (x + a / x), jnp.maximum(a, 1.0))
+    root = jnp.where(a > 0, root, 0.0)
     valid = jnp.isfinite(a) & (a >= 0)
     roots = jnp.where(valid, root, 1.0)
     return Candidates(models=jnp.stack([roots, -roots])[:, None], valid=jnp.stack([valid, valid]))

@@ -1,9 +1,9 @@
 """Least squares over many observations and few variables, handed to optimistix as a system of few equations.
 
-A loop that carries residuals and Jacobian of every observation is bound by memory. All that Levenberg–Marquardt needs is
-M = [J r]ᵀ[J r]. With M = L Lᵀ, the d + 1 residuals r̃ = (last row of L) with Jacobian J̃ = (first d rows of L)ᵀ have the
-same cost, gradient Jᵀr and Gauss–Newton matrix JᵀJ, whatever the number of observations. So M is summed over the
-observations in one pass, and optimistix sees d + 1 residuals.
+A loop that carries residuals and Jacobian of every observation is bound by memory. All that Levenberg–Marquardt needs
+is M = [J r]ᵀ[J r]. With M = L Lᵀ, the d + 1 residuals r̃ = (last row of L) with Jacobian J̃ = (first d rows of L)ᵀ
+have the same cost, gradient Jᵀr and Gauss–Newton matrix JᵀJ, whatever the number of observations. So M is summed over
+the observations in one pass, and optimistix sees d + 1 residuals.
 """
 
 from collections.abc import Callable

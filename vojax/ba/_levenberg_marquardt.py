@@ -3,7 +3,8 @@
 Minimises ½‖r(y)‖² over a tangent increment y. Two things differ from optimistix' stock solver:
 
 - damping is by the diagonal, (JᵀJ + λ diag JᵀJ) d = −Jᵀr (Marquardt 1963), so that metres and radians need no scaling;
-- λ starts small and follows the gain ratio (Nielsen 1999), so that a good Gauss–Newton problem takes Gauss–Newton steps.
+- λ starts small and follows the gain ratio (Nielsen 1999), so that a good Gauss–Newton problem takes Gauss–Newton
+steps.
 """
 
 import dataclasses
@@ -26,8 +27,8 @@ class LMOptions:
     Attributes:
         max_steps: Most evaluations of the residuals, rejected steps included.
         initial_damping: λ of the first step, relative to the diagonal of JᵀJ.
-        tolerance: The solve ends with the step that promises to lower the cost by less than this share of it. None takes
-            what the dtype can resolve, 256 eps: 3e-5 in float32, 6e-14 in float64.
+        tolerance: The solve ends with the step that promises to lower the cost by less than this share of it. None
+            takes what the dtype can resolve, 256 eps: 3e-5 in float32, 6e-14 in float64.
     """
 
     max_steps: int = 20
@@ -44,9 +45,9 @@ class _SearchState(eqx.Module):
 class NielsenSearch(optx.AbstractSearch):
     """Accept steps that reduce the cost and steer λ by the gain ratio.
 
-    The step size handed to the descent is 1/λ. Residuals are expected in units of their standard deviation. A step whose
-    predicted gain is below the rounding error of the cost is taken as it is, so that float32 solves end instead of
-    shrinking their steps for ever.
+    The step size handed to the descent is 1/λ. Residuals are expected in units of their standard deviation. A step
+    whose predicted gain is below the rounding error of the cost is taken as it is, so that float32 solves end instead
+    of shrinking their steps for ever.
 
     References: Nielsen, "Damping parameter in Marquardt's method", IMM-REP-1999-05, eq. (2.5).
     """

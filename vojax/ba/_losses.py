@@ -160,7 +160,7 @@ def mad_scale(residuals: Float[ArrayLike, " n"], mask: Bool[ArrayLike, " n"] | N
     References: Rousseeuw & Croux, "Alternatives to the median absolute deviation", 1993.
     """
     residuals = jnp.asarray(residuals)
-    mask = jnp.ones(residuals.shape, bool) if mask is None else mask
+    mask = jnp.ones(residuals.shape, bool) if mask is None else jnp.asarray(mask)
     center = _masked_median(residuals, mask)
     return 1.4826 * _masked_median(jnp.abs(residuals - center), mask)
 

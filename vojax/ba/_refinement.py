@@ -1,7 +1,8 @@
 """Refinement of one pose against many observations: the six-dof least squares behind every absolute-pose estimate.
 
-Minimises ½Σ wᵢ ρ(‖Σᵢ^{-1/2}(π(T Xᵢ) − zᵢ)‖²) over T = cam_from_world (Scaramuzza & Fraundorfer 2011, eq. (10)). The state is the
-camera-frame tangent ξ about a fixed pose T₀, T = exp(−ξ) T₀, so nothing in the loop sees world coordinates.
+Minimises ½Σ wᵢ ρ(‖Σᵢ^{-1/2}(π(T Xᵢ) − zᵢ)‖²) over T = cam_from_world (Scaramuzza & Fraundorfer 2011, eq. (10)). The
+state is the camera-frame tangent ξ about a fixed pose T₀, T = exp(−ξ) T₀, so nothing in the loop sees world
+coordinates.
 """
 
 from typing import Any
@@ -37,8 +38,8 @@ class Refinement(eqx.Module):
 
     Attributes:
         model: The pose `cam_from_world`.
-        covariance: Of the camera-frame tangent ξ (translation first; the state is `world_from_cam @ exp(ξ)`), inverse of
-            the Gauss–Newton matrix; zero where the problem is degenerate.
+        covariance: Of the camera-frame tangent ξ (translation first; the state is `world_from_cam @ exp(ξ)`), inverse
+            of the Gauss–Newton matrix; zero where the problem is degenerate.
         cost: ½Σ w ρ at the model.
         iterations: Evaluations of the residuals.
         result: How it ended.
@@ -90,7 +91,7 @@ def refine_absolute_pose(
     points_world, measurements = jnp.asarray(points_world), jnp.asarray(measurements)
     n, d = measurements.shape
     if points_world.shape != (n, 3):
-        raise ValueError(f"points_world has shape {points_world.shape}: expected ({n}, 3), one row for each measurement")
+        raise ValueError(f"points_world has shape {points_world.shape}: expected ({n}, 3), one for each measurement")
     dtype = jnp.result_type(points_world, measurements)
     weight = None if weights is None else jnp.asarray(weights, dtype)
     if mask is not None:
@@ -155,7 +156,7 @@ def _residual(x: Array, y: Array, z: Array, observations: _Observations, camera:
 def _accumulate(points: Any, observations: _Observations, camera: Any, loss: Loss) -> Array:
     """[J r]ᵀ[J r] for a camera-frame perturbation of points that are already in the camera frame."""
     x, y, z = points
-    residual, derivative = jax.linearize(lambda *p: _residual(*p, observations, camera, loss), x, y, z)
+    residual, derivative = jax.linearize(lambda a, b, c: _residual(a, b, c, observations, camera, loss), x, y, z)
     one, zero = jnp.ones_like(x), jnp.zeros_like(x)
     by_x, by_y, by_z = derivative(one, zero, zero), derivative(zero, one, zero), derivative(zero, zero, one)
     # X(ξ) = exp(−ξ) X has dX = −ρ + X × φ, so the row by φ is (a, b, c) × X.

@@ -52,8 +52,8 @@ class Reduced(eqx.Module):
 def reduce(system: ArrowSystem) -> Reduced:
     """Eliminate the landmarks and factor what is left.
 
-    Cameras without information (fixed, or seeing nothing) and landmarks without information get an increment of zero. If
-    S is not positive definite in working precision, `regular` is False and the factor is the identity.
+    Cameras without information (fixed, or seeing nothing) and landmarks without information get an increment of zero.
+    If S is not positive definite in working precision, `regular` is False and the factor is the identity.
     """
     dtype = system.camera.dtype
     c, p = system.cross.shape[2:]
@@ -113,8 +113,8 @@ class SchurDescent(optx.AbstractDescent):
     """Levenberg–Marquardt step of a bundle: landmarks eliminated, cameras solved densely, landmarks substituted back.
 
     Works on `y = (camera increments [c, 6], landmark increments [p, 3])` and a tuple of residual components `[c, p]`.
-    Each residual depends on one camera and one landmark, so six and three products with tangents of ones give every block
-    of the Jacobian exactly.
+    Each residual depends on one camera and one landmark, so six and three products with tangents of ones give every
+    block of the Jacobian exactly.
     """
 
     def init(self, y: Any, f_info_struct: Any) -> _SchurState:

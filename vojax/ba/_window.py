@@ -1,7 +1,8 @@
 """Sliding-window bundle adjustment: poses and landmarks of a few keyframes together, against all their measurements.
 
-Every window has the same shape [keyframes, landmarks] and says by a mask what was seen, so one compilation serves a whole
-sequence. The solve is anchored: the origin moves to the oldest keyframe, and float32 never sees absolute coordinates.
+Every window has the same shape [keyframes, landmarks] and says by a mask what was seen, so one compilation serves a
+whole sequence. The solve is anchored: the origin moves to the oldest keyframe, and float32 never sees absolute
+coordinates.
 """
 
 from typing import Any
@@ -76,9 +77,11 @@ def adjust_window(
 
     Degenerate input: cameras and landmarks without information do not move. A window whose cameras are not determined
         by its measurements ends as `degenerate` with zero covariances.
-    Differentiability: both modes, in the measurements, their noise and the camera, by the implicit function theorem with
-        the exact Hessian, solved by the same elimination. Starting values, fixed poses among them, have derivative zero.
-    References: Szeliski, "Computer Vision", section 11.4; Triggs et al., "Bundle adjustment - a modern synthesis", 2000.
+    Differentiability: both modes, in the measurements, their noise and the camera, by the implicit function theorem
+        with the exact Hessian, solved by the same elimination. Starting values, fixed poses among them, have
+        derivative zero.
+    References: Szeliski, "Computer Vision", section 11.4; Triggs et al., "Bundle adjustment - a modern synthesis",
+        2000.
     """
     points_world, measurements = jnp.asarray(points_world), jnp.asarray(measurements)
     mask = jnp.asarray(mask)

@@ -102,7 +102,7 @@ def _response(gray: np.ndarray, options: DetectorOptions) -> np.ndarray:
         # root mean square gradient (Sobel/8) in grey levels per pixel.
         return np.sqrt(np.maximum(eigenvalue, 0.0)) * np.float32(255.0 / 2.0)
     response = np.zeros(gray.shape, np.float32)
-    fast = cv2.FastFeatureDetector_create(threshold=max(1, round(options.min_quality)), nonmaxSuppression=True)
+    fast = cv2.FastFeatureDetector.create(threshold=max(1, round(options.min_quality)), nonmaxSuppression=True)
     for keypoint in fast.detect(gray, None):
         response[round(keypoint.pt[1]), round(keypoint.pt[0])] = keypoint.response
     return response

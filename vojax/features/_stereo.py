@@ -12,7 +12,7 @@ lets windows lie on the ground.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -164,7 +164,8 @@ def _box_sum(values: np.ndarray, length: int, axis: int) -> np.ndarray:
     def cut(array: np.ndarray, start: int, count: int) -> np.ndarray:
         return array[start : start + count] if axis == 0 else array[:, start : start + count]
 
-    out, done, power, run = None, 0, 1, values
+    out: Any = None
+    done, power, run = 0, 1, values
     while True:
         if length & power:
             part = cut(run, done, size)
@@ -272,7 +273,10 @@ def _refine(left, right, border, points, disparity, row_offset, options: StereoO
     base = (points[:, 0] - (start - radius - margin)).astype(np.float32)
     current, rows, slope = disparity.astype(np.float32), row_offset.astype(np.float32), np.zeros(n, np.float32)
     pull = inverse[:, 2:, 3:] * prior[3:].astype(np.float32)
-    step = theta = sampled = gain = None
+    step: Any = None
+    theta: Any = None
+    sampled: Any = None
+    gain: Any = None
     for iteration in range(options.iterations + 1):
         if iteration <= 2:
             # The row offset settles first; later it moves by less than the gradients' own error.

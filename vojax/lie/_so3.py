@@ -89,8 +89,8 @@ class SO3(eqx.Module):
         References: Shepperd, "Quaternion from rotation matrix", 1978.
         """
         # The barrier makes all components select the same row where two are equally large.
-        matrix = jax.lax.optimization_barrier(as_floating(matrix, 3, 3))
-        (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = split_matrix(matrix)
+        entries = jax.lax.optimization_barrier(as_floating(matrix, 3, 3))
+        (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = split_matrix(entries)
         # Row i of 4 q qᵀ is 4 q_i q. The diagonal sums to 4, so its largest entry is at least 1 and the row is safe to
         # normalise; all four rows are formed, one is selected.
         rows = (

@@ -22,9 +22,7 @@ class KeyframeOptions:
     min_shared: int = 60
 
 
-def is_keyframe(
-    distance: float, depths: np.ndarray, shared: int, options: KeyframeOptions = KeyframeOptions()
-) -> bool:
+def is_keyframe(distance: float, depths: np.ndarray, shared: int, options: KeyframeOptions = KeyframeOptions()) -> bool:
     """Decide before the motion is accepted into the window.
 
     Args:

@@ -1,8 +1,8 @@
-"""Motion between two stereo frames: triangulate at k−1, solve the pose at k, weigh every point by its depth's uncertainty.
+"""Motion between two stereo frames: triangulate at k−1, solve the pose at k, weigh points by their depth's uncertainty.
 
-A depth f b/d from a small disparity is uncertain and biased outwards. PnP that takes such points as exact inherits the bias
-as scale. Here the point's covariance is carried into the measurement at k, Σ = Σ_k + J Σ_{k−1} Jᵀ, so that a far point says
-much about rotation and little about distance (Matthies & Shafer 1987).
+A depth f b/d from a small disparity is uncertain and biased outwards. PnP that takes such points as exact inherits the
+bias as scale. Here the point's covariance is carried into the measurement at k, Σ = Σ_k + J Σ_{k−1} Jᵀ, so that a far
+point says much about rotation and little about distance (Matthies & Shafer 1987).
 """
 
 import dataclasses
@@ -86,7 +86,9 @@ class Motion(eqx.Module):
 _UNKNOWN_PX = 100.0
 
 
-def measurement_covariance(sigma_position: float, sigma_disparity: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
+def measurement_covariance(
+    sigma_position: float, sigma_disparity: Float[Array, "*batch"]
+) -> Float[Array, "*batch 3 3"]:
     """Covariance of (u_left, v, u_right) where u_left, v and the disparity u_left − u_right are independent."""
     position = jnp.full_like(sigma_disparity, sigma_position**2)
     zero = jnp.zeros_like(position)
@@ -128,9 +130,7 @@ def stereo_motion(
     near = usable & (disparity0 > options.ransac_min_disparity_px)
     # A scene without near points still makes hypotheses from what there is.
     near = jnp.where(jnp.sum(near) >= 20, near, usable)
-    rough, consensus = search_absolute_pose(
-        points0, second[:, :2], stereo.camera, near, quality, key, options.ransac
-    )
+    rough, consensus = search_absolute_pose(points0, second[:, :2], stereo.camera, near, quality, key, options.ransac)
     found = jnp.sum(consensus.inliers) > 3
     pose = SE3(jnp.where(found, rough.wxyz_xyz, guess.wxyz_xyz))
 
@@ -205,7 +205,9 @@ def stereo_motion(
         jnp.sum(inliers),
         depths,
         jnp.where(
-            (features1.has_disparity & (points[:, 2] > 0))[:, None], stereo.camera.project(pose.apply(points)), second[:, :2]
+            (features1.has_disparity & (points[:, 2] > 0))[:, None],
+            stereo.camera.project(pose.apply(points)),
+            second[:, :2],
         ),
         updated,
     )

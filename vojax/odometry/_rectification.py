@@ -1,9 +1,10 @@
 """Self-calibration of what rectification leaves behind: disparities that are wrong by a smooth function of the column.
 
-A disparity that is a fraction of a pixel too small everywhere makes every depth, and so the whole trajectory, too long. The
-error cannot be seen in one frame, nor averaged away over many points. It shows in motion: points at different depths and
-columns disagree on how far the camera went. So the error d_true − d = a₀ + a₁ x², with x = (u − c_x)/f_x, is estimated
-recursively beside the motion: each frame adds its information on (a₀, a₁), its own pose marginalised.
+A disparity that is a fraction of a pixel too small everywhere makes every depth, and so the whole trajectory, too
+long. The error cannot be seen in one frame, nor averaged away over many points. It shows in motion: points at
+different depths and columns disagree on how far the camera went. So the error d_true − d = a₀ + a₁ x², with x = (u −
+c_x)/f_x, is estimated recursively beside the motion: each frame adds its information on (a₀, a₁), its own pose
+marginalised.
 """
 
 import equinox as eqx
@@ -38,9 +39,12 @@ class DisparityCalibration(eqx.Module):
         """(a₀, a₁) in pixels."""
         (a, b), (_, d) = self.information
         determinant = a * d - b * b
-        return jnp.stack([d * self.vector[0] - b * self.vector[1], a * self.vector[1] - b * self.vector[0]]) / determinant
+        first, second = self.vector
+        return jnp.stack([d * first - b * second, a * second - b * first]) / determinant
 
-    def add(self, hessian: Float[Array, "8 8"], gradient: Float[Array, "8"], at: Float[Array, "2"]) -> "DisparityCalibration":
+    def add(
+        self, hessian: Float[Array, "8 8"], gradient: Float[Array, "8"], at: Float[Array, "2"]
+    ) -> "DisparityCalibration":
         """Add a frame's evidence.
 
         Args:
@@ -55,9 +59,7 @@ class DisparityCalibration(eqx.Module):
         usable = jnp.all(jnp.isfinite(reduced)) & jnp.all(jnp.isfinite(rhs))
         share = jnp.where(usable, _EVIDENCE_SHARE, 0.0)
         reduced, rhs = jnp.where(usable, reduced, 0.0), jnp.where(usable, rhs, 0.0)
-        return DisparityCalibration(
-            self.information + share * reduced, self.vector + share * (reduced @ at - rhs)
-        )
+        return DisparityCalibration(self.information + share * reduced, self.vector + share * (reduced @ at - rhs))
 
 
 def disparity_terms(u_left: Float[Array, "*shape"], stereo: RectifiedStereo) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vojax._result import Result
-from vojax._types import Array, Float
+from vojax._types import Array, ArrayLike, Float
 from vojax.ba import GemanMcClure, LMOptions, Window, adjust_window
 from vojax.cameras import RectifiedStereo
 from vojax.lie import SE3
@@ -101,7 +101,7 @@ class SlidingWindow:
             matched[i, columns] = frame.sigma_disparity[rows] > 0
             sigma[i, columns] = np.where(matched[i, columns], frame.sigma_disparity[rows], 1.0)
         # A landmark that no keyframe has matched in the right image has no place to start from.
-        mask &= matched.any(axis=0)[None]
+        mask &= np.any(matched, axis=0, keepdims=True)
         window = _adjust(
             SE3.from_matrix(jnp.asarray(poses, jnp.float32)), measurements, sigma, mask, matched, offsets, self._stereo,
             self._options,
@@ -126,14 +126,15 @@ def orthonormal(pose: np.ndarray) -> np.ndarray:
 @eqx.filter_jit
 def _adjust(
     poses: SE3,
-    measurements: Array,
-    sigma: Array,
-    mask: Array,
-    matched: Array,
+    measurements: ArrayLike,
+    sigma: ArrayLike,
+    mask: ArrayLike,
+    matched: ArrayLike,
     offsets: Array,
     stereo: RectifiedStereo,
     options: WindowOptions,
 ) -> Window:
+    sigma, mask, matched = jnp.asarray(sigma), jnp.asarray(mask), jnp.asarray(matched)
     measurements = corrected(jnp.asarray(measurements), offsets, stereo)
     # Landmarks start where the first keyframe that matched them saw them.
     first = jnp.argmax(matched, axis=0)

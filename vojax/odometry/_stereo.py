@@ -1,8 +1,8 @@
 """Stereo 3-D-to-2-D odometry, frame by frame.
 
 Scaramuzza & Fraundorfer 2011, algorithm "VO from 3-D-to-2-D correspondences", with stereo instead of two views: track
-features from k−1 to k, triangulate them at k−1 from the stereo pair, solve the pose at k, chain C_k = C_{k−1} T_k, and adjust
-the last keyframes together.
+features from k−1 to k, triangulate them at k−1 from the stereo pair, solve the pose at k, chain C_k = C_{k−1} T_k, and
+adjust the last keyframes together.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Robust camera pose from points and pixels: P3P hypotheses, MSAC, local optimisation, refinement on the inliers.
 
-References: Nistér, Naroditsky & Bergen, "Visual odometry", CVPR 2004; Scaramuzza & Fraundorfer, "Visual odometry, part I",
-2011, section "3-D-to-2-D".
+References: Nistér, Naroditsky & Bergen, "Visual odometry", CVPR 2004; Scaramuzza & Fraundorfer, "Visual odometry, part
+I", 2011, section "3-D-to-2-D".
 """
 
 from typing import Any
@@ -48,7 +48,8 @@ class AbsolutePoseEstimator(eqx.Module):
     def squared_error(self, models: Float[Array, "12 *lanes"], observation: tuple[Array, ...]) -> Array:
         """Squared reprojection error in px²; points behind the camera are infinitely wrong."""
         x, y, z, u, v = observation
-        xc, yc, zc = (models[4 * i] * x + models[4 * i + 1] * y + models[4 * i + 2] * z + models[4 * i + 3] for i in range(3))
+        rows = (models[0:4], models[4:8], models[8:12])
+        xc, yc, zc = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in rows)
         pu, pv = self.camera.project_xyz(xc, yc, zc)
         return jnp.where(zc > 0, (pu - u) * (pu - u) + (pv - v) * (pv - v), jnp.inf)
 
@@ -72,11 +73,10 @@ def _matrix_lanes(parameters: Float[Array, "7 *lanes"]) -> Float[Array, "12 *lan
     w, x, y, z, tx, ty, tz = parameters
     xx, yy, zz = x * x, y * y, z * z
     xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
-    return jnp.stack(
-        [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy), tx]
-        + [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx), ty]
-        + [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy), tz]
-    )
+    row0 = [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy), tx]
+    row1 = [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx), ty]
+    row2 = [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy), tz]
+    return jnp.stack([*row0, *row1, *row2])
 
 
 def _pose(model: Float[Array, "12"]) -> SE3:
@@ -106,19 +106,20 @@ def estimate_absolute_pose(
         camera: A camera of `vojax.cameras`.
         key: Random key; the same key gives the same answer, bit for bit.
         options: Of the search. Inliers are within `threshold_px` pixels.
-        sigma_px: Noise of the pixels, which scales the covariance and weighs the last refinement: one standard deviation,
-            one for each observation, or covariances `[n, 2, 2]` in px² (for uncertain points add J Σ_X Jᵀ).
+        sigma_px: Noise of the pixels, which scales the covariance and weighs the last refinement: one standard
+            deviation, one for each observation, or covariances `[n, 2, 2]` in px² (for uncertain points add J Σ_X Jᵀ).
         quality: Of each correspondence, higher is better; guides the sampling.
         mask: False for padding.
 
     Returns:
-        `model` is `cam_from_world`; `covariance` that of the camera-frame tangent ξ, translation first, where the state is
-        `world_from_cam @ exp(ξ)`.
+        `model` is `cam_from_world`; `covariance` that of the camera-frame tangent ξ, translation first, where the
+        state is `world_from_cam @ exp(ξ)`.
 
     Degenerate input: fewer valid correspondences than four, all points behind the camera or no agreement end with a
         result code, the identity as model and zero covariance; never NaN.
     Differentiability: both modes, in points, pixels, camera and noise, through the last refinement by the implicit
         function theorem with the exact Hessian; the choice of inliers is constant.
+
     Raises:
         ValueError: If shapes do not fit or there are fewer than three correspondences.
     References: see the module.
@@ -126,8 +127,8 @@ def estimate_absolute_pose(
     Example:
         >>> import jax, vojax
         >>> camera = vojax.cameras.Pinhole(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0, maxval=1.0) + jnp.array([0.0, 0.0, 5.0])
-        >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
+        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0, maxval=1.0) + jnp.array([0.0, 0.0,
+        5.0]) >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
         >>> int(estimate.num_inliers)
         50
     """
@@ -135,8 +136,8 @@ def estimate_absolute_pose(
     n = points_world.shape[0]
     if points_world.shape != (n, 3) or pixels.shape != (n, 2):
         raise ValueError(
-            f"points_world has shape {points_world.shape} and pixels {pixels.shape}: expected (n, 3) and (n, 2), one row "
-            "for each correspondence"
+            f"points_world has shape {points_world.shape} and pixels {pixels.shape}: expected (n, 3) and (n, 2), "
+            "one row for each correspondence"
         )
     if n < 3:
         raise ValueError(f"{n} correspondences: a pose needs at least 3, and 4 to be unique")
@@ -145,9 +146,15 @@ def estimate_absolute_pose(
 
 @eqx.filter_jit
 def _estimate(
-    points_world: Array, pixels: Array, camera: Any, key: Any, options: RansacOptions, sigma_px: Any, quality: Any, mask: Any
+    points_world: Array,
+    pixels: Array,
+    camera: Any,
+    key: Any,
+    options: RansacOptions,
+    sigma_px: Any,
+    quality: Any,
+    mask: Any,
 ) -> Estimate[SE3]:
-    n = points_world.shape[0]
     finite = jnp.all(jnp.isfinite(points_world), axis=1) & jnp.all(jnp.isfinite(pixels), axis=1)
     mask = finite if mask is None else finite & jnp.asarray(mask)
     points_world = jnp.where(mask[:, None], points_world, 0.0)
@@ -199,7 +206,8 @@ def search_absolute_pose(
 ) -> tuple[SE3, Consensus]:
     """Search a pose without the last refinement: the first half of `estimate_absolute_pose`, for use inside jit.
 
-    It runs in float32, so the points should not be far from the origin for their extent; nothing in it is differentiated.
+    It runs in float32, so the points should not be far from the origin for their extent; nothing in it is
+    differentiated.
 
     Returns:
         `cam_from_world` in the dtype of the points, the identity where nothing was found; and the consensus.

@@ -26,7 +26,11 @@ class Estimator(Protocol):
 
     sample_size: int
     limit: float
-    observations: tuple[Array, ...]
+
+    @property
+    def observations(self) -> tuple[Array, ...]:
+        """Components of the observations, `[n]` each."""
+        ...
 
     def hypothesize(self, sample: Int[Array, "m k"]) -> tuple[Float[Array, "d ks"], Bool[Array, " ks"]]:
         """Solve minimal samples; the solutions of one sample stand in different lanes."""

@@ -37,6 +37,14 @@ class RansacOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a positive number")
         if not 0 < self.confidence < 1:
             raise ValueError(f"confidence is {self.confidence}: expected a probability between 0 and 1, both excluded")
-        for name in ("max_hypotheses", "chunk_size", "coarse_points", "survivors", "top_k", "local_steps", "final_steps"):
+        for name in (
+            "max_hypotheses",
+            "chunk_size",
+            "coarse_points",
+            "survivors",
+            "top_k",
+            "local_steps",
+            "final_steps",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")

@@ -69,7 +69,8 @@ def guided_pool(
 ) -> Int[Array, " k"]:
     """Size of the pool of best observations for the t-th sample.
 
-    The pool grows as PROSAC's: T_n / T_N = (n/N)^m gives n(t) = N (t/T_N)^(1/m), so that the last sample draws from all.
+    The pool grows as PROSAC's: T_n / T_N = (n/N)^m gives n(t) = N (t/T_N)^(1/m), so that the last sample draws from
+    all.
 
     References: Chum & Matas, "Matching with PROSAC", CVPR 2005, eq. (3).
     """

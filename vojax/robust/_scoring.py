@@ -16,7 +16,11 @@ SquaredError = Callable[[Array, tuple[Array, ...]], Array]
 
 
 def msac_scores(
-    squared_error: SquaredError, models: Float[Array, "d k"], observations: Any, weights: Float[Array, " n"], limit: float
+    squared_error: SquaredError,
+    models: Float[Array, "d k"],
+    observations: Any,
+    weights: Float[Array, " n"],
+    limit: float,
 ) -> Float[Array, " k"]:
     """Score models in the lanes, one observation after the other.
 
