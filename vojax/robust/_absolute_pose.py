@@ -127,8 +127,8 @@ def estimate_absolute_pose(
     Example:
         >>> import jax, vojax
         >>> camera = vojax.cameras.Pinhole(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0, maxval=1.0) + jnp.array([0.0, 0.0,
-        5.0]) >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
+        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0) + jnp.array([0.0, 0.0, 5.0])
+        >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
         >>> int(estimate.num_inliers)
         50
     """

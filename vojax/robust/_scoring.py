@@ -25,7 +25,7 @@ def msac_scores(
     """Score models in the lanes, one observation after the other.
 
     A scan over observations with the models innermost is the layout that is fast on every jax version measured; a
-    broadcast [models, observations] is up to ten times slower on some (DESIGN notes in docs/performance.md).
+    broadcast [models, observations] is up to ten times slower on some (benchmarks/RESULTS.md).
 
     Args:
         squared_error: Of models against one observation.
