@@ -63,7 +63,7 @@ def cholesky_factor(matrix: Float[Array, "d d *lanes"]) -> tuple[list[Array], li
 
     Returns:
         The columns of L, from the diagonal down `[d − k, *lanes]`; the inverses of its diagonal; and a mask that is
-        False where M is singular to working precision. There the offending columns and their inverses are 0, so that
+        False where M is singular to working precision. Columns whose pivot is noise are 0, their inverses too, so that
         solutions stay finite and have no component along directions without information.
     """
     size = matrix.shape[0]
@@ -108,6 +108,13 @@ def cholesky_solve(
 
 
 def symmetric_inverse(matrix: Float[Array, "d d *lanes"]) -> tuple[Float[Array, "d d *lanes"], Bool[Array, "*lanes"]]:
-    """Invert small positive definite matrices, and say which could be inverted."""
+    """Invert small positive definite matrices, and say which could be inverted.
+
+    A matrix is singular to working precision when, scaled to unit diagonal, its condition number exceeds 1/(32 eps), 3e5
+    in float32: beyond, rounding in its entries decides a direction (points on a line reach 2e6 and more).
+    """
     identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(matrix.shape[:2] + (1,) * (matrix.ndim - 2))
-    return cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape))
+    inverse, regular = cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape))
+    # The trace of the scaled inverse bounds its largest eigenvalue.
+    trace = sum(matrix[i, i] * inverse[i, i] for i in range(matrix.shape[0]))
+    return inverse, regular & (trace < 1.0 / (32.0 * float(jnp.finfo(matrix.dtype).eps)))

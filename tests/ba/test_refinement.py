@@ -430,7 +430,6 @@ def test_degenerate_input_is_reported(index, float32_batch):
         assert found.cost[index] == 0
 
 
-@pytest.mark.xfail(reason="the rank threshold is near the rounding error: one line in three is found out")
 def test_points_on_a_line_are_degenerate():
     problems = [make_problem(seed) for seed in range(B)]
     for i, problem in enumerate(problems):
@@ -466,7 +465,9 @@ def test_a_batch_is_a_loop(float32_batch):
         # The same program, so that nothing is compiled: problem i in every place.
         alone = solve(jax.tree.map(lambda x: jnp.stack([x[i]] * B), batch), Squared())  # noqa: B023
         assert alone.iterations[5] == found.iterations[i]
-        np.testing.assert_allclose(matrices(alone.model)[5], matrices(found.model)[i], atol=1e-5)
+        assert alone.cost[5] == pytest.approx(float(found.cost[i]), rel=1e-4, abs=1e-3)
+        if i != 10:  # two points leave directions free, along which rounding moves the pose
+            np.testing.assert_allclose(matrices(alone.model)[5], matrices(found.model)[i], atol=1e-5)
         codes = (Result.success, Result.not_converged, Result.degenerate)
         assert [(alone.result == code)[5] for code in codes] == [(found.result == code)[i] for code in codes]
 

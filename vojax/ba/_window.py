@@ -75,8 +75,8 @@ def adjust_window(
     Returns:
         The adjusted window.
 
-    Degenerate input: cameras and landmarks without information do not move. A window whose cameras are not determined
-        by its measurements ends as `degenerate` with zero covariances.
+    Degenerate input: cameras and landmarks without information do not move. A window with a free keyframe that its
+        measurements do not determine ends as `degenerate` with zero covariances: pad with fixed keyframes.
     Differentiability: both modes, in the measurements, their noise and the camera, by the implicit function theorem
         with the exact Hessian, solved by the same elimination. Starting values, fixed poses among them, have
         derivative zero.
@@ -111,7 +111,11 @@ def adjust_window(
     increments = _zero_increments(start)
     residual_at = lambda state: lambda y: _residual(y, (state, data, loss))  # noqa: E731
     final, jvp = jax.linearize(residual_at((poses, points)), increments)
-    covariances, regular = _schur.camera_covariances(_schur.arrow_system(increments, final, jvp))
+    system = _schur.arrow_system(increments, final, jvp)
+    covariances, regular = _schur.camera_covariances(system)
+    blind = free & (system.camera[0, 0] == 0)
+    regular = regular & ~jnp.any(blind)
+    covariances = jnp.where(regular, covariances, 0.0)
     result = Result.where(converged, Result.success, Result.not_converged)
     result = Result.where(regular, result, Result.degenerate)
     return Window(

@@ -102,9 +102,11 @@ class SlidingWindow:
             sigma[i, columns] = np.where(matched[i, columns], frame.sigma_disparity[rows], 1.0)
         # A landmark that no keyframe has matched in the right image has no place to start from.
         mask &= np.any(matched, axis=0, keepdims=True)
+        fixed = ~np.any(mask, axis=1)  # padding, and keyframes that share nothing with the others
+        fixed[0] = True
         window = _adjust(
-            SE3.from_matrix(jnp.asarray(poses, jnp.float32)), measurements, sigma, mask, matched, offsets, self._stereo,
-            self._options,
+            SE3.from_matrix(jnp.asarray(poses, jnp.float32)), measurements, sigma, mask, matched, fixed, offsets,
+            self._stereo, self._options,
         )  # fmt: skip
         if not bool((window.result == Result.success) | (window.result == Result.not_converged)):
             return
@@ -130,6 +132,7 @@ def _adjust(
     sigma: ArrayLike,
     mask: ArrayLike,
     matched: ArrayLike,
+    fixed: ArrayLike,
     offsets: Array,
     stereo: RectifiedStereo,
     options: WindowOptions,
@@ -153,6 +156,7 @@ def _adjust(
         mask,
         stereo,
         sigma_px=covariance,
+        fixed=jnp.asarray(fixed),
         loss=GemanMcClure(2.0),
         options=LMOptions(max_steps=options.max_steps),
     )

@@ -19,6 +19,7 @@ from vojax.solvers import p3p
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
+from ._significance import chance_in_image, is_significant
 
 
 class AbsolutePoseEstimator(eqx.Module):
@@ -115,8 +116,9 @@ def estimate_absolute_pose(
         `model` is `cam_from_world`; `covariance` that of the camera-frame tangent ξ, translation first, where the
         state is `world_from_cam @ exp(ξ)`.
 
-    Degenerate input: fewer valid correspondences than four, all points behind the camera or no agreement end with a
-        result code, the identity as model and zero covariance; never NaN.
+    Degenerate input: fewer valid correspondences than four, all points behind the camera, points on a line, or no
+        more agreement than chance would give end with a result code, the identity as model and zero covariance; never
+        NaN.
     Differentiability: both modes, in points, pixels, camera and noise, through the last refinement by the implicit
         function theorem with the exact Hessian; the choice of inliers is constant.
 
@@ -127,7 +129,7 @@ def estimate_absolute_pose(
     Example:
         >>> import jax, vojax
         >>> camera = vojax.cameras.Pinhole(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
-        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0) + jnp.array([0.0, 0.0, 5.0])
+        >>> points = jax.random.uniform(jax.random.key(0), (50, 3), minval=-1.0).at[:, 2].add(5.0)
         >>> estimate = estimate_absolute_pose(points, camera.project(points), camera, key=jax.random.key(1))
         >>> int(estimate.num_inliers)
         50
@@ -178,7 +180,10 @@ def _estimate(
     )
     inliers, score = _judge(refined.model, centered, pixels, camera, mask, options)
     num_inliers = jnp.sum(inliers)
-    result = Result.where(num_inliers > 3, refined.result, Result.no_consensus)
+    agreed = is_significant(num_inliers, count, 3, chance_in_image(pixels, mask, options.threshold_px))
+    result = Result.where(agreed, refined.result, Result.no_consensus)
+    # Where not one sample could be solved, it is the observations that are at fault.
+    result = Result.where(jnp.any(consensus.model != 0), result, Result.degenerate)
     result = Result.where(count >= 4, result, Result.too_few)
     usable = (result == Result.success) | (result == Result.not_converged)
     shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)

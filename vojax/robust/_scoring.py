@@ -11,6 +11,9 @@ import jax.numpy as jnp
 
 from vojax._types import Array, Float
 
+# Observations judged per pass over the models: 1.3 G residuals/s with one, 3.0 with eight, 2.5 with sixteen (jax 0.10.1).
+_UNROLL = 8
+
 # squared_error(models, observation) -> [*lanes], elementwise over models [d, *lanes] and one observation's components.
 SquaredError = Callable[[Array, tuple[Array, ...]], Array]
 
@@ -44,5 +47,5 @@ def msac_scores(
         return total + weight * jnp.minimum(error * (1.0 / limit), 1.0), None
 
     start = jnp.zeros(models.shape[1:], models.dtype)
-    total, _ = jax.lax.scan(add, start, (*observations, weights))
+    total, _ = jax.lax.scan(add, start, (*observations, weights), unroll=_UNROLL)
     return total

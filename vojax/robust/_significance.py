@@ -1,0 +1,46 @@
+"""Whether a consensus could be chance: the expected number of models that pure noise would support as well.
+
+With n observations that agree with any model by chance with probability p, the expected number of minimal models with k
+supporters is at most
+
+    NFA = (n − m) C(n, k) C(k, m) p^(k − m),
+
+the count of all choices of k supporters and of a sample of m among them. A consensus means something when NFA is
+small, for any n, k and p, where a fixed least number of supporters is right for one.
+
+References: Moisan & Stival, "A probabilistic criterion to detect rigid point matches", IJCV 2004, eq. (11).
+"""
+
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+
+from vojax._types import Array, Bool, Float, Int
+
+
+def is_significant(
+    num_inliers: Int[Array, ""], count: Int[Array, ""], sample_size: int, chance: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether fewer than one model of pure noise is expected to have as many supporters.
+
+    Args:
+        num_inliers: Supporters k, those of the sample included.
+        count: Observations n.
+        sample_size: Observations m that determine a model.
+        chance: Probability p that an observation that has nothing to do with a model agrees with it.
+    """
+    n, k, m = count.astype(chance.dtype), num_inliers.astype(chance.dtype), float(sample_size)
+    enough = num_inliers > sample_size
+    k = jnp.where(enough, k, m + 1.0)
+    n = jnp.maximum(n, k)
+    log_choices = gammaln(n + 1) - gammaln(n - k + 1) - gammaln(k - m + 1) - gammaln(m + 1)  # C(n, k) C(k, m)
+    log_alarms = jnp.log(n - m) + log_choices + (k - m) * jnp.log(jnp.clip(chance, 1e-30, 1.0))
+    return enough & (log_alarms < 0)
+
+
+def chance_in_image(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
+    """Probability that a random pixel lies within the threshold of another; pixels fill their bounding box."""
+    low = jnp.min(jnp.where(mask[:, None], pixels, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], pixels, -jnp.inf), axis=0)
+    # A box thinner than the disc counts with the disc's width.
+    width, height = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold_px)
+    return jnp.minimum(jnp.pi * threshold_px**2 / (width * height), 1.0)
