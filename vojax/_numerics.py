@@ -110,8 +110,8 @@ def cholesky_solve(
 def symmetric_inverse(matrix: Float[Array, "d d *lanes"]) -> tuple[Float[Array, "d d *lanes"], Bool[Array, "*lanes"]]:
     """Invert small positive definite matrices, and say which could be inverted.
 
-    A matrix is singular to working precision when, scaled to unit diagonal, its condition number exceeds 1/(32 eps), 3e5
-    in float32: beyond, rounding in its entries decides a direction (points on a line reach 2e6 and more).
+    A matrix is singular to working precision when, scaled to unit diagonal, its condition number exceeds 1/(32 eps),
+    3e5 in float32: beyond, rounding in its entries decides a direction (points on a line reach 2e6 and more).
     """
     identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(matrix.shape[:2] + (1,) * (matrix.ndim - 2))
     inverse, regular = cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape))

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 
 from vojax._types import Array, Float
 
-# Observations judged per pass over the models: 1.3 G residuals/s with one, 3.0 with eight, 2.5 with sixteen (jax 0.10.1).
+# Observations judged per pass over the models: 1.3 G residuals/s with one, 3.0 with eight, 2.5 with sixteen
+# (jax 0.10.1).
 _UNROLL = 8
 
 # squared_error(models, observation) -> [*lanes], elementwise over models [d, *lanes] and one observation's components.
