@@ -108,8 +108,25 @@ def test_version_is_that_of_the_installed_package():
 
 
 def public_map() -> dict[str, object]:
-    # jaxtyping's import hook, on under pytest, leaves its own name in every module.
-    return {name: value for name, value in vars(vojax).items() if not name.startswith("_") and name != "jaxtyping"}
+    return {name: getattr(vojax, name) for name in dir(vojax) if not name.startswith("_")}
+
+
+def test_every_public_name_is_there_and_no_other():
+    assert {"SE3", "estimate_absolute_pose", "solvers"} <= public_map().keys()
+    # What type checkers read and what is loaded on first use are two lists of the same names.
+    (block,) = [
+        node for node in ast.parse(pathlib.Path(vojax.__file__).read_text("utf-8")).body if isinstance(node, ast.If)
+    ]
+    declared = {alias.asname for node in block.body for alias in node.names}
+    assert declared == public_map().keys()
+    with pytest.raises(AttributeError, match="no_such_name"):
+        vojax.no_such_name  # noqa: B018
+
+
+def test_the_command_line_explains_itself_without_jax():
+    result = run_fresh("import vojax.cli; vojax.cli.main(['--help']); print('jax' in sys.modules)")
+    assert "Visual odometry" in result.stdout
+    assert result.stdout.splitlines()[-1] == "False"
 
 
 def test_public_map_lets_no_dependency_through():

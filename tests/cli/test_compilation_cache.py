@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from vojax.cli._compilation_cache import cache_folder, enable_compilation_cache
+from vojax.cli._compilation_cache import cache_folder, enable_compilation_cache, processor_name
 
 
 def test_every_program_is_kept(own_cache_folder):
     assert enable_compilation_cache() is None
-    folder = own_cache_folder / "vojax" / "jax"
+    folder = own_cache_folder / "vojax" / "jax" / processor_name()
     compilation_cache.reset_cache()  # In a process of its own nothing is compiled before.
     before = set(folder.iterdir())
     jax.jit(lambda x: x * 2.5 + 0.75)(jnp.ones(3)).block_until_ready()

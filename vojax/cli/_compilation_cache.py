@@ -1,7 +1,9 @@
 """JAX's persistent compilation cache in the user's cache folder: the second start compiles nothing."""
 
+import hashlib
 import os
 import pathlib
+import platform
 import sys
 
 import jax
@@ -21,6 +23,17 @@ def cache_folder() -> pathlib.Path:
     return base / "vojax" / "jax"
 
 
+def processor_name() -> str:
+    """A folder name for this kind of processor: programs of another kind may not run, and home folders are shared."""
+    features = platform.processor()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
+            features = next((line for line in lines if line.startswith(("flags", "Features"))), features)
+    except OSError:
+        pass
+    return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:8]}"
+
+
 def enable_compilation_cache() -> str | None:
     """Keep every compiled program on disk. Call it before JAX compiles anything.
 
@@ -32,7 +45,7 @@ def enable_compilation_cache() -> str | None:
     if jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         return None
     try:
-        folder = cache_folder()
+        folder = cache_folder() / processor_name()
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError) as error:
         return f"no folder for compiled programs ({error}); the next start will compile again"

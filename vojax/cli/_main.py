@@ -26,6 +26,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         `VOJAX_TRACEBACK=1` in the environment errors are raised instead.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    # XLA reports programs out of its own cache as built for another processor, at length and wrongly; it reads this
+    # when JAX is first imported.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # A degree sign must not end a run where output is ASCII.
