@@ -55,7 +55,7 @@ def central_differences(function, arguments, index, step=1e-6):
 def relative_pose_problems(count, n, seed=0, planar=False):
     """Unit bearings [count, n, 3] in both views, rotations and unit translations of cam1_from_cam0.
 
-    Depths are 1 to 10 baselines in view 0, rotations up to about half a radian in any direction; all points are in front
+    Depths are 2.5 to 10 baselines in view 0, rotations about half a radian in any direction; all points are in front
     of both cameras. `planar` puts the points of a problem on one plane.
     """
     rng = np.random.default_rng(seed)

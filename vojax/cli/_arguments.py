@@ -69,16 +69,31 @@ class Eval:
 
 
 @dataclasses.dataclass(frozen=True)
+class Bench:
+    """Measure the speed of vojax on this machine: run it while nothing else computes."""
+
+    what: Annotated[Literal["solvers"], tyro.conf.Positional]
+    """What is measured."""
+    batch: Annotated[int, tyro.conf.arg(metavar="N")] = 100_000
+    """Problems solved in one call."""
+    only: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Only those with this in their names."""
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write the numbers to this file too."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Help:
     """The user asked for help and has read it."""
 
 
-Command = Demo | Run | Eval
-_COMMANDS = ("demo", "run", "eval")
+Command = Demo | Run | Eval | Bench
+_COMMANDS = ("demo", "run", "eval", "bench")
 _Choice = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 

@@ -9,6 +9,13 @@ from ._errors import reprojection_error as reprojection_error
 from ._errors import sampson_error as sampson_error
 from ._errors import sampson_residual as sampson_residual
 from ._errors import symmetric_epipolar_error as symmetric_epipolar_error
+from ._essential import EssentialMotions as EssentialMotions
+from ._essential import cheirality_votes as cheirality_votes
+from ._essential import decompose_essential as decompose_essential
+from ._essential import pose_from_essential as pose_from_essential
+from ._homography import HomographyMotion as HomographyMotion
+from ._homography import decompose_homography as decompose_homography
+from ._homography import metric_translation as metric_translation
 from ._linear_triangulation import ray_distance_std as ray_distance_std
 from ._linear_triangulation import ray_distances as ray_distances
 from ._linear_triangulation import triangulate_dlt as triangulate_dlt
@@ -18,4 +25,6 @@ from ._linear_triangulation import triangulate_rays as triangulate_rays
 from ._refined_triangulation import Triangulation as Triangulation
 from ._refined_triangulation import TriangulationOptions as TriangulationOptions
 from ._refined_triangulation import triangulate_refine as triangulate_refine
+from ._rq import camera_from_projection as camera_from_projection
+from ._rq import rq_decompose as rq_decompose
 from ._stereo import triangulate_rectified as triangulate_rectified

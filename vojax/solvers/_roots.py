@@ -21,7 +21,7 @@ from ._components import floor, sign
 
 # Iterations per interval up to degree 4 and beyond. Of random polynomials whose roots are all real, these find all
 # roots up to degree 4 to rounding and 99.7 % at degree 10 (misses are roots that lie within 1e-3 of others).
-_STEPS = {"float32": (6, 8), "float64": (8, 12)}
+_STEPS = {"float32": (6, 8), "float64": (8, 16)}
 
 
 def quadratic_roots(c: Float[Array, "3 *lanes"]) -> tuple[Float[Array, "2 2 *lanes"], Bool[Array, "2 *lanes"]]:
@@ -45,7 +45,7 @@ def quadratic_roots(c: Float[Array, "3 *lanes"]) -> tuple[Float[Array, "2 2 *lan
     q = half + sign(half) * jnp.sqrt(jnp.maximum(discriminant, 0.0))
     # x = q / c2 and c0 / q; both factors of a pair vanish only where c1 = 0 and one of c0, c2 is.
     lost = q == 0
-    first = jnp.stack([jnp.where(lost, 0.0, q), jnp.where(lost & (c[2] == 0), 1.0, c[2])])
+    first = jnp.stack([jnp.where(lost & (c[2] == 0), 1.0, q), c[2]])
     second = jnp.stack([jnp.where(lost, jnp.where(c[2] == 0, 1.0, 0.0), c[0]), jnp.where(lost, c[2], q)])
     return _normalise(jnp.stack([first, second], axis=1), jnp.stack([valid, valid]))
 
@@ -78,19 +78,20 @@ def polynomial_roots(
     size = jnp.max(jnp.abs(c), axis=0)
     proper = jnp.isfinite(size) & (size > 0)
     c = jnp.where(proper[None], c / jnp.where(proper, size, 1.0)[None], 0.0)
+    c, unit = _balance(c)
     both = jnp.stack([c, c[::-1]], axis=1)  # [terms, 2, *lanes]: in x, and in 1/x
     x, valid = _roots_within_one(both)
     valid = valid & proper[None, None]
     # A root at |x| = 1 belongs to the first half.
     valid = valid.at[:, 1].set(valid[:, 1] & (jnp.abs(x[:, 1]) < 1.0))
     one = jnp.ones_like(x[:, 0])
-    u = jnp.concatenate([x[:, 0], one])
+    u = jnp.concatenate([x[:, 0] * unit[None], unit[None] * one])
     v = jnp.concatenate([one, x[:, 1]])
     packed = pack(jnp.stack([u, v]), jnp.concatenate([valid[:, 0], valid[:, 1]]), slots)
     return _normalise(*packed)
 
 
-def evaluate(c: Float[Array, "terms *lanes"], x: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+def evaluate(c: Float[Array, "terms *#lanes"], x: Float[Array, "*#lanes"]) -> Float[Array, "*lanes"]:
     """The polynomial at x, by Horner's rule."""
     value = c[-1]
     for k in range(c.shape[0] - 2, -1, -1):
@@ -106,6 +107,28 @@ def pack(
     chosen = [valid & (place == slot) for slot in range(slots)]
     taken = [jnp.sum(jnp.where(here[None], values, 0.0), axis=1) for here in chosen]
     return jnp.stack(taken, axis=1), jnp.stack([jnp.any(here, axis=0) for here in chosen])
+
+
+def _balance(c: Array) -> tuple[Array, Array]:
+    """Substitute x = σ y such that half of the roots are smaller than one and half are larger, in magnitude.
+
+    Clusters of small or of large roots are then spread over [-1, 1], whatever a few far ones do. log σ is where the
+    upper envelope of the lines log |c_k| + (k - d/2) log σ is lowest: at the highest crossing of a falling and a rising
+    one. σ is a power of two.
+    """
+    degree = c.shape[0] - 1
+    log = jnp.log2(jnp.maximum(jnp.abs(c), float(jnp.finfo(c.dtype).tiny)))
+    exponent, highest = jnp.zeros_like(log[0]), jnp.full_like(log[0], -jnp.inf)
+    for i in range((degree + 1) // 2):
+        for j in range(degree // 2 + 1, degree + 1):
+            crossing = (log[i] - log[j]) / (j - i)
+            height = log[i] + (i - 0.5 * degree) * crossing
+            exponent = jnp.where(height > highest, crossing, exponent)
+            highest = jnp.maximum(height, highest)
+    limit = 100 // degree  # coefficients change by 2^50 at most
+    exponent = jnp.clip(jnp.round(exponent), -limit, limit)
+    scaled = [c[k] * jnp.exp2((k - degree // 2) * exponent) for k in range(degree + 1)]
+    return jnp.stack(scaled), jnp.exp2(exponent)
 
 
 def _normalise(pairs: Array, valid: Array) -> tuple[Array, Array]:
