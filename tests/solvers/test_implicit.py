@@ -5,6 +5,7 @@ import pytest
 
 from vojax.solvers import Candidates, implicit
 from vojax.solvers._implicit import solve_square
+from vojax.solvers._lanes import lanes_last
 
 
 def square_roots(data):
@@ -61,3 +62,18 @@ def test_linear_solve_of_a_singular_matrix(dtype):
         np.testing.assert_array_equal(solve_square(singular, rhs), 0.0)
         backward = jax.grad(lambda rhs, singular=singular: jnp.sum(solve_square(singular, rhs)))(rhs)
         np.testing.assert_array_equal(backward, 0.0)
+
+
+def test_chunks_of_lanes_give_what_one_pass_gives():
+    def kernel(x, y):
+        return x[0] * y[0] + x[1], jnp.stack([x[0] - y[0], x[1] * 2.0])
+
+    rng = np.random.default_rng(0)
+    x, y = (rng.normal(size=(23, 2)).astype(np.float32) for _ in range(2))
+    whole = jax.vmap(lanes_last(kernel))(jnp.asarray(x), jnp.asarray(y))
+    for size in (4, 23, 64):  # the last piece is shorter; just one; less than one
+        parts = jax.vmap(lanes_last(kernel, chunk=size))(jnp.asarray(x), jnp.asarray(y))
+        for one, other in zip(whole, parts, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+    shared = jax.vmap(lanes_last(kernel, chunk=4), in_axes=(0, None))(jnp.asarray(x), jnp.asarray(y[0]))
+    np.testing.assert_allclose(shared[0], x[:, 0] * y[0, 0] + x[:, 1], rtol=1e-6)
