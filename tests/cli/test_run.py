@@ -1,5 +1,6 @@
 import io
 import json
+import pathlib
 import platform
 import subprocess
 import sys
@@ -159,7 +160,7 @@ def test_demo_draws_its_tracks_too(vojax_command, fake, drawn_for_real, tmp_path
 def test_compiled_programs_go_to_the_users_cache(run_kitti, fake, own_cache_folder):
     assert run_kitti().status == 0
     assert (own_cache_folder / "vojax" / "jax").is_dir()
-    assert jax.config.jax_compilation_cache_dir == str(own_cache_folder / "vojax" / "jax")
+    assert pathlib.Path(jax.config.jax_compilation_cache_dir).parent == own_cache_folder / "vojax" / "jax"
 
 
 def test_without_a_cache_the_run_goes_on(run_kitti, fake, tmp_path, monkeypatch):

@@ -1,0 +1,53 @@
+"""`vojax bench`: what it says, writes and refuses. Not how fast anything is."""
+
+import inspect
+import json
+
+import pytest
+
+from vojax import solvers
+from vojax.cli import main
+from vojax.cli._bench_solvers import problems
+
+
+def test_one_solver_is_measured_in_both_precisions(tmp_path, capsys):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "solvers", "--batch", "64", "--only", "homography_four", "--json", str(file)]) == 0
+    assert "homography_four_point" in capsys.readouterr().out
+    written = json.loads(file.read_text())
+    assert [(row["name"], row["dtype"]) for row in written["rows"]] == [
+        ("homography_four_point", "float32"),
+        ("homography_four_point", "float64"),
+    ]
+    for row in written["rows"]:
+        assert 0 < row["best"] <= row["nanoseconds"]
+        assert row["compile_seconds"] > 0
+    assert written["batch"] == 64
+    assert written["versions"]["jax"]
+
+
+def test_every_minimal_solver_is_in_the_table():
+    named = {name.split(",")[0] for name in problems(2)}
+    takes_points = {
+        name
+        for name, value in vars(solvers).items()
+        if inspect.isfunction(value)
+        and {"rays0", "ray0", "pixels0", "bearings"} & inspect.signature(value).parameters.keys()
+    }
+    helpers = {"one_point_histogram", "dlt_pnp", "select_by_fourth_point", "select_by_second_p3p"}
+    assert takes_points - named <= helpers
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["solvers", "--batch", "0"], "batch is 0"),
+        (["solvers", "--only", "no_such_solver"], "no_such_solver"),
+        (["everything"], "expected one of 'solvers'"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, words, capsys):
+    assert main(["bench", *arguments]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert len(captured.err.strip().splitlines()) == 1
