@@ -183,6 +183,7 @@ def test_is_the_minimum_that_scipy_finds(x64):
         assert np.abs(gradient).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_steps_are_those_of_automatic_derivatives(x64):
     # The hand-written gradient and second derivatives, rotations perturbed on the left.
     data, _, rotation, translation = problems(1, 12, seed=17, sigma=0.05, padded=12)
