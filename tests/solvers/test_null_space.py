@@ -3,12 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vojax.solvers._null_space import eliminate, null_space, null_space_and_rank, null_vector_of_gram
+from vojax.solvers._null_space import eliminate, null_space, null_space_and_rank
 
 EPS = {jnp.float32: 1.2e-7, jnp.float64: 2.3e-16}
 
 basis_of = jax.jit(null_space)
-vector_of = jax.jit(null_vector_of_gram, static_argnums=1)
 
 
 def solve(rows, dtype):
@@ -86,85 +85,6 @@ def test_one_problem_equals_many(x64):
     many = solve(rows, np.float64)
     for i in range(20):
         np.testing.assert_allclose(null_space(jnp.asarray(rows[i])), many[i], atol=1e-13)
-
-
-def grams(singular, n, seed):
-    """AᵀA [count, n, n] with the given singular values [count, n], and their last singular vector."""
-    rng = np.random.default_rng(seed)
-    vectors = np.linalg.qr(rng.normal(size=(len(singular), n, n)))[0]
-    return np.einsum("bij,bj,bkj->bik", vectors, singular**2, vectors), vectors[..., -1]
-
-
-def vectors(gram, dtype, steps=6):
-    return np.moveaxis(np.asarray(vector_of(np.moveaxis(gram, 0, -1).astype(dtype), steps), np.float64), -1, 0)
-
-
-@pytest.mark.parametrize("n", [3, 4, 6, 9, 12])
-def test_least_eigenvector_equals_numpy(dtype, n):
-    rng = np.random.default_rng(n)
-    points = rng.normal(size=(300, 3 * n, n)).astype(dtype).astype(np.float64)
-    exact = rng.normal(size=(300, n))
-    exact /= np.linalg.norm(exact, axis=-1, keepdims=True)
-    rows = points - np.einsum("bij,bj,bk->bik", points, exact, exact)  # least eigenvalue zero
-    rows += 1e-3 * points
-    gram = np.einsum("bij,bik->bjk", rows, rows).astype(dtype).astype(np.float64)
-    values, expected = np.linalg.eigh(gram)
-    found = vectors(gram, dtype)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=10 * EPS[dtype])
-    alignment = np.abs(np.sum(found * expected[..., 0], axis=-1))
-    sine = np.sqrt(np.maximum(1.0 - alignment**2, 0.0))
-    # Rounding of the matrix over the gap of its eigenvalues.
-    bound = 100 * n * EPS[dtype] * values[:, -1] / (values[:, 1] - values[:, 0]) + 1e-7 * (dtype == jnp.float64)
-    assert (sine < np.maximum(bound, 3.0 * np.sqrt(EPS[dtype]) * (dtype == jnp.float32))).all()
-
-
-def test_convergence_is_the_ratio_of_eigenvalues(x64):
-    singular = np.concatenate([np.full((200, 8), 1.0), np.full((200, 1), 0.1)], axis=1)
-    gram, expected = grams(singular, 9, seed=6)
-    errors = []
-    for steps in (1, 2, 3):
-        found = vectors(gram, np.float64, steps)
-        found = found * np.sign(np.sum(found * expected, axis=-1, keepdims=True))
-        errors.append(np.median(np.linalg.norm(found - expected, axis=-1)))
-    np.testing.assert_allclose([errors[1] / errors[0], errors[2] / errors[1]], 0.01, rtol=0.05)
-
-
-def test_rank_deficient_by_one_is_found_to_rounding(dtype):
-    singular = np.random.default_rng(7).uniform(0.2, 1.0, (300, 9))
-    singular[:, -1] = 0.0
-    gram, expected = grams(singular, 9, seed=8)
-    found = vectors(gram, dtype)
-    found = found * np.sign(np.sum(found * expected, axis=-1, keepdims=True))
-    assert np.abs(found - expected).max() < (2e-4 if dtype == jnp.float32 else 1e-12)
-
-
-def test_repeated_least_eigenvalue_gives_a_vector_of_its_space(dtype):
-    singular = np.ones((300, 6))
-    singular[:, 3:] = 0.0
-    gram, _ = grams(singular, 6, seed=9)
-    found = vectors(gram, dtype)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-6)
-    assert np.abs(np.einsum("bij,bj->bi", gram, found)).max() < (1e-5 if dtype == jnp.float32 else 1e-13)
-
-
-def test_degenerate_grams_give_unit_vectors(dtype):
-    gram = np.stack(
-        [
-            np.zeros((4, 4)),
-            np.eye(4),
-            np.ones((4, 4)),
-            np.diag([1.0, 0.0, 0.0, 0.0]),
-            np.diag([0.0, 0.0, 0.0, 1.0]),
-            1e-20 * np.eye(4),
-            1e12 * np.diag([1.0, 2.0, 3.0, 0.0]),
-        ]
-    )
-    found = vectors(gram, dtype)
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, atol=1e-5)
-    residual = np.einsum("bij,bj->bi", gram, found)
-    assert np.abs(residual[2:5]).max() < 1e-5
-    assert np.abs(found[6, 3]) > 1.0 - 1e-5
 
 
 def test_gradient_of_the_projector(x64):

@@ -1,10 +1,10 @@
-"""Null spaces and null vectors in the lanes.
+"""Null spaces and linear systems in the lanes.
 
 `null_space` completes the rows of a wide matrix to an orthonormal basis by Householder reflections, one row after the
-other: what is left over is the null space, to rounding, whatever the rows' conditioning. `null_vector_of_gram` finds
-the least eigenvector of AᵀA for tall matrices.
+other: what is left over is the null space, to rounding, whatever the rows' conditioning. `eliminate` solves square
+systems with many right-hand sides.
 
-References: G. Golub, C. Van Loan. Matrix Computations, 4th edition, sections 5.1 and 8.2.
+References: G. Golub, C. Van Loan. Matrix Computations, 4th edition, sections 3.4 and 5.1.
 """
 
 import jax
@@ -86,50 +86,3 @@ def eliminate(rows: Float[Array, "m n *lanes"]) -> Float[Array, "m q *lanes"]:
         return jax.lax.dynamic_update_index_in_dim(rows, row, k, 0)
 
     return jax.lax.fori_loop(0, m, step, rows)[:, m:]
-
-
-def null_vector_of_gram(gram: Float[Array, "n n *lanes"], steps: int = 6) -> Float[Array, "n *lanes"]:
-    """Unit eigenvector of the least eigenvalue of symmetric positive semidefinite matrices, by inverse iteration.
-
-    Args:
-        gram: Matrices AᵀA.
-        steps: Solves; the error falls by the ratio of the two least eigenvalues in each.
-
-    Degenerate input: where the least eigenvalue is repeated, some vector of its space; for a zero matrix a unit vector.
-    """
-    n = gram.shape[0]
-    diagonal = jnp.stack([gram[i, i] for i in range(n)])
-    size = jnp.maximum(jnp.sum(diagonal, axis=0), floor(gram) ** 2)
-    # A shift at rounding makes the factorisation safe and leaves the vectors as they are.
-    shift = n * float(jnp.finfo(gram.dtype).eps) * size
-    identity = jnp.eye(n, dtype=gram.dtype).reshape(n, n, *(1,) * (gram.ndim - 2))
-    rest = gram + identity * shift[None, None]
-    columns: list[Array] = []
-    pivots: list[Array] = []
-    for _ in range(n):  # L D Lᵀ with unit L
-        pivot = jnp.maximum(rest[0, 0], 0.25 * shift)
-        column = rest[1:, 0] / pivot[None]
-        rest = rest[1:, 1:] - column[:, None] * rest[0, 1:][None]
-        columns.append(column)
-        pivots.append(pivot)
-
-    def solve(x: Array) -> Array:
-        forward = []
-        for column in columns:
-            forward.append(x[0])
-            x = x[1:] - column * x[0][None]
-        back = jnp.zeros_like(x)
-        for entry, pivot, column in zip(forward[::-1], pivots[::-1], columns[::-1], strict=True):
-            entry = entry / pivot - jnp.sum(column * back, axis=0)
-            back = jnp.concatenate([entry[None], back])
-        return back
-
-    def iterate(_: object, x: Array) -> Array:
-        y = solve(x)
-        y = y / jnp.max(jnp.abs(y), axis=0)[None]
-        return y / jnp.sqrt(jnp.sum(y * y, axis=0))[None]
-
-    # Irregular, so that it is not orthogonal to the eigenvectors of symmetric configurations.
-    start = jnp.asarray([0.31, 0.83, -0.27, 0.52, -0.71, 0.19, 0.43, -0.64, 0.91, -0.36, 0.58, 0.77][:n], gram.dtype)
-    start = jnp.broadcast_to(start.reshape((n,) + (1,) * (gram.ndim - 2)), gram.shape[1:])
-    return jax.lax.fori_loop(0, steps, iterate, start)
