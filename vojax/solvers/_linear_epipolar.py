@@ -246,11 +246,20 @@ def least_vector_and_second(
     def image(x: Array) -> Array:
         return jnp.stack([pivots[k] * x[k] + jnp.sum(tails[k] * x[k + 1 :], axis=0) for k in range(columns)])
 
+    def across(y: Array, x: Array) -> Array:
+        """The part of y that is orthogonal to x, of unit length."""
+        rest = y - jnp.sum(x * y, axis=0)[None] * x
+        # A clear null vector draws both iterates onto itself, now and then to the last bit: then any other vector.
+        along = [jnp.sum(x * start, axis=0) for start in starts]
+        spare = jnp.where((jnp.abs(along[0]) < jnp.abs(along[1]))[None], starts[0], starts[1])
+        lost = jnp.sum(rest * rest, axis=0) < (64.0 * eps) ** 2
+        rest = _unit(jnp.where(lost[None], spare - jnp.sum(x * spare, axis=0)[None] * x, rest))
+        return _unit(rest - jnp.sum(x * rest, axis=0)[None] * x)
+
     def iterate(_: object, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, y, second = state
-        x, y = solve(x), solve(y)
-        y = _unit(y - jnp.sum(x * y, axis=0)[None] * x)
-        y = _unit(y - jnp.sum(x * y, axis=0)[None] * x)
+        x = solve(x)
+        y = across(solve(y), x)
         # One Jacobi rotation makes the images orthogonal, the shorter one first.
         rx, ry = image(x), image(y)
         gamma = 2.0 * jnp.sum(rx * ry, axis=0)
@@ -268,8 +277,9 @@ def least_vector_and_second(
         return jnp.where(swap, y, x), jnp.where(swap, x, y), jnp.minimum(second, jnp.maximum(rx, ry))
 
     # Irregular, so that they are not orthogonal to the singular vectors of symmetric configurations.
-    starts = jnp.asarray(_STARTS, rows.dtype)[:, :columns].reshape((2, columns) + (1,) * (rows.ndim - 2))
-    x, y = (jnp.broadcast_to(start, rows.shape[1:]) for start in starts)
+    both = jnp.asarray(_STARTS, rows.dtype)[:, :columns].reshape((2, columns) + (1,) * (rows.ndim - 2))
+    starts = [jnp.broadcast_to(start, rows.shape[1:]) for start in both]
+    x, y = starts
     x, y, second = jax.lax.fori_loop(0, steps, iterate, (x, y, jnp.full_like(total, jnp.inf)))
     return x, jnp.where(proper, second, 0.0)
 

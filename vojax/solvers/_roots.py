@@ -39,8 +39,8 @@ def quadratic_roots(c: Float[Array, "3 *lanes"]) -> tuple[Float[Array, "2 2 *lan
     c = jnp.where(proper[None], c / jnp.where(proper, size, 1.0)[None], 0.0)
     half = -0.5 * c[1]
     discriminant = half * half - c[0] * c[2]
-    # Rounding must not lose a double root.
-    slack = 4.0 * float(jnp.finfo(c.dtype).eps) * (half * half + jnp.abs(c[0] * c[2]))
+    # Rounding, of some eps in each coefficient, must not lose a double root.
+    slack = 16.0 * float(jnp.finfo(c.dtype).eps) * (half * half + jnp.abs(c[0] * c[2]))
     valid = proper & (discriminant >= -slack)
     q = half + sign(half) * jnp.sqrt(jnp.maximum(discriminant, 0.0))
     # x = q / c2 and c0 / q; both factors of a pair vanish only where c1 = 0 and one of c0, c2 is.
