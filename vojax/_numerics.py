@@ -53,6 +53,18 @@ def cross3(a: Vector3, b: Vector3) -> Vector3:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
+def complement(unit: Vector3) -> tuple[Vector3, Vector3]:
+    """Two unit vectors that complete a unit vector to an orthonormal, right-handed frame.
+
+    References: T. Duff et al. Building an orthonormal basis, revisited. JCGT 2017.
+    """
+    x, y, z = unit
+    s = jnp.where(z < 0, -1.0, 1.0).astype(z.dtype)
+    p = -1.0 / (s + z)
+    xy = x * y * p
+    return (1.0 + s * x * x * p, s * xy, -s * x), (xy, s + y * y * p, -y)
+
+
 def cholesky_factor(matrix: Float[Array, "d d *lanes"]) -> tuple[list[Array], list[Array], Array]:
     """Factor small positive semidefinite matrices M = L Lᵀ, one column after the other.
 

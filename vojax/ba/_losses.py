@@ -8,6 +8,7 @@ that it has finite derivatives at s = 0.
 from typing import Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from vojax._numerics import safe_sqrt
@@ -87,6 +88,45 @@ class GemanMcClure(eqx.Module):
     def weight(self, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Derivative of the loss."""
         return 1.0 / (1.0 + s / self.scale**2) ** 2
+
+
+class Tukey(eqx.Module):
+    """Biweight: smooth, and flat beyond `scale` standard deviations, so that outliers have no weight at all.
+
+    References: Beaton & Tukey, "The fitting of power series", 1974.
+    """
+
+    scale: Float[Array, ""] | float = 4.685
+
+    def rho(self, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Loss of a squared residual norm."""
+        rest = jnp.maximum(1.0 - s / self.scale**2, 0.0)
+        return self.scale**2 / 3.0 * (1.0 - rest**3)
+
+    def weight(self, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Derivative of the loss."""
+        return jnp.maximum(1.0 - s / self.scale**2, 0.0) ** 2
+
+
+class GaussianUniform(eqx.Module):
+    """Maximum likelihood of Gaussian inliers among uniform outliers: ρ(s) = −2 log((e^(−s/2) + u) / (1 + u)).
+
+    With u = e^(−cut²/2) an observation at `cut` standard deviations is as likely an outlier as an inlier; its weight
+    there is ½, and 1/(1 + u) at zero. Marginalising the scale, as MAGSAC++ does, gives nearly the same weights.
+
+    References: Torr & Zisserman, "MLESAC", 2000, eq. (4).
+    """
+
+    cut: Float[Array, ""] | float = 3.0
+
+    def rho(self, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Loss of a squared residual norm."""
+        low = -0.5 * self.cut**2
+        return 2.0 * (jnp.logaddexp(0.0, low) - jnp.logaddexp(-0.5 * s, jnp.broadcast_to(low, s.shape)))
+
+    def weight(self, s: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Derivative of the loss."""
+        return jax.nn.sigmoid(0.5 * (self.cut**2 - s))
 
 
 class Barron(eqx.Module):

@@ -86,6 +86,25 @@ def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
         world, cam = absolute(n)
         return world, *bearings(cam)
 
+    def rig(n: int) -> tuple[np.ndarray, ...]:
+        world, cam = absolute(n)
+        centers = rng.uniform(-0.5, 0.5, (batch, n, 3))
+        return world, centers, *bearings(cam - centers)
+
+    def rig_motion(n: int) -> tuple[np.ndarray, ...]:
+        points0, points1 = relative(n)
+        centers0, centers1 = (rng.uniform(-0.5, 0.5, (batch, n, 3)) for _ in range(2))
+        return *bearings(points0 - centers0, points1 - centers1), centers0, centers1
+
+    def unknown_focal(n: int) -> tuple[np.ndarray, ...]:
+        world, cam = absolute(n)
+        return world, rng.uniform(400.0, 2000.0, (batch, 1, 1)) * cam[..., :2] / cam[..., 2:]
+
+    def lines(n: int) -> tuple[np.ndarray, ...]:
+        world, cam = absolute(2 * n)
+        cam = cam.reshape(batch, n, 2, 3)
+        return world.reshape(batch, n, 2, 3), np.cross(cam[..., 0, :], cam[..., 1, :])
+
     table = {
         "p3p": (solvers.p3p, lambda: pose(3), 237.0),
         "p3p_grunert": (solvers.p3p_grunert, lambda: pose(3), None),
@@ -105,7 +124,17 @@ def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
         "homography_four_point": (solvers.homography_four_point, lambda: planar(4), 35.0),
         "homography_dlt, 10 points": (solvers.homography_dlt, lambda: planar(10), None),
         "rotation_from_rays, 2 rays": (solvers.rotation_from_rays, lambda: bearings(*relative(2)), None),
+        "rigid_three_point": (solvers.rigid_three_point, lambda: relative(3), None),
         "procrustes, 3 points": (solvers.procrustes, lambda: relative(3), None),
+        "procrustes_quaternion, 3 points": (solvers.procrustes_quaternion, lambda: relative(3), None),
+        "affine_3d, 10 points": (solvers.affine_3d, lambda: relative(10), None),
+        "gp3p": (solvers.gp3p, lambda: rig(3), 1750.0),
+        "gpnp, 10 points": (solvers.gpnp, lambda: rig(10), None),
+        "generalized_relative_pose, 17 points": (solvers.generalized_relative_pose, lambda: rig_motion(17), None),
+        "p4pf": (solvers.p4pf, lambda: unknown_focal(4), 2485.0),
+        "p5pfr": (solvers.p5pfr, lambda: unknown_focal(5), 1460.0),
+        "p3l": (solvers.p3l, lambda: lines(3), None),
+        "p2p1l": (solvers.p2p1l, lambda: (*pose(2), *lines(1)), None),
     }
     return {name: Problem(*entry) for name, entry in table.items()}
 

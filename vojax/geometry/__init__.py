@@ -16,6 +16,7 @@ from ._essential import pose_from_essential as pose_from_essential
 from ._homography import HomographyMotion as HomographyMotion
 from ._homography import decompose_homography as decompose_homography
 from ._homography import metric_translation as metric_translation
+from ._line_errors import line_reprojection_error as line_reprojection_error
 from ._linear_triangulation import ray_distance_std as ray_distance_std
 from ._linear_triangulation import ray_distances as ray_distances
 from ._linear_triangulation import triangulate_dlt as triangulate_dlt

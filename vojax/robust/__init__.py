@@ -1,8 +1,14 @@
 from ._absolute_pose import AbsolutePoseEstimator as AbsolutePoseEstimator
 from ._absolute_pose import estimate_absolute_pose as estimate_absolute_pose
 from ._absolute_pose import search_absolute_pose as search_absolute_pose
+from ._alignment import estimate_rigid as estimate_rigid
+from ._alignment import estimate_similarity as estimate_similarity
 from ._engine import Consensus as Consensus
 from ._estimate import Estimate as Estimate
+from ._matrix_models import estimate_fundamental as estimate_fundamental
+from ._matrix_models import estimate_homography as estimate_homography
 from ._options import RansacOptions as RansacOptions
+from ._relative_pose import estimate_relative_pose as estimate_relative_pose
+from ._relative_pose import search_relative_pose as search_relative_pose
 from ._sampling import required_hypotheses as required_hypotheses
 from ._scoring import msac_scores as msac_scores

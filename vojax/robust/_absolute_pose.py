@@ -54,8 +54,9 @@ class AbsolutePoseEstimator(eqx.Module):
         pu, pv = self.camera.project_xyz(xc, yc, zc)
         return jnp.where(zc > 0, (pu - u) * (pu - u) + (pv - v) * (pv - v), jnp.inf)
 
-    def polish(self, model: Float[Array, "12"], inliers: Bool[Array, " n"]) -> Float[Array, "12"]:
+    def polish(self, model: Float[Array, "12"], mask: Bool[Array, " n"]) -> Float[Array, "12"]:
         """A few steps of robust Gauss–Newton."""
+        inliers = mask & (self.squared_error(model[:, None], self.observations) <= self.limit)
         refined = polish_absolute_pose(
             _pose(model),
             self.points,

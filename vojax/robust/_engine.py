@@ -1,8 +1,8 @@
 """Batched RANSAC: thousands of hypotheses at once, on any estimator.
 
 Draw a chunk of minimal samples, solve them in the lanes, judge all on a subset of the observations and the survivors on
-all of them, keep the best few; stop when confident. Then polish the best few and return the best of those. Everything
-here sees constants only: derivatives belong to the last refinement, which is the caller's.
+all of them, polish the best few and keep the best; stop when confident. Everything here sees constants only:
+derivatives belong to the last refinement, which is the caller's.
 
 References: Fischler & Bolles, "Random sample consensus", 1981; Chum, Matas & Kittler, "Locally optimized RANSAC", 2003.
 """
@@ -40,8 +40,8 @@ class Estimator(Protocol):
         """Squared error of models against observations, elementwise; infinite or large where impossible."""
         ...
 
-    def polish(self, model: Float[Array, " d"], inliers: Bool[Array, " n"]) -> Float[Array, " d"]:
-        """Improve one model on its inliers."""
+    def polish(self, model: Float[Array, " d"], mask: Bool[Array, " n"]) -> Float[Array, " d"]:
+        """Improve one model on what agrees with it among the observations that count."""
         ...
 
 
@@ -56,8 +56,8 @@ class Consensus(eqx.Module):
 
 class _State(eqx.Module):
     chunk: Int[Array, ""]
-    models: Float[Array, "d top"]
-    scores: Float[Array, " top"]
+    model: Float[Array, " d"]
+    score: Float[Array, ""]
     required: Float[Array, ""]
 
 
@@ -106,36 +106,31 @@ def search(
         best, kept = jax.lax.top_k(-coarse_scores, min(options.survivors, models.shape[1]))
         survivors = models[:, kept]
         scores = jnp.where(jnp.isfinite(best), scores_of(survivors, estimator.observations, weights), jnp.inf)
-        merged, merged_scores = jnp.concatenate([state.models, survivors], 1), jnp.concatenate([state.scores, scores])
-        negative, top = jax.lax.top_k(-merged_scores, options.top_k)
-        inliers = jnp.sum(_inliers(estimator, merged[:, top[0]], mask))
-        ratio = inliers / jnp.maximum(count, 1)
+        # Local optimisation of the best of the chunk, so that one good sample is enough to stop.
+        _, top = jax.lax.top_k(-scores, min(options.top_k, scores.shape[0]))
+        found = jnp.isfinite(scores[top])
+        polished = jax.vmap(lambda model: estimator.polish(model, mask), -1, -1)(survivors[:, top])
+        polished_scores = jnp.where(found, scores_of(polished, estimator.observations, weights), jnp.inf)
+        models = jnp.concatenate([state.model[:, None], survivors[:, top], polished], axis=1)
+        scores = jnp.concatenate([state.score[None], scores[top], polished_scores])
+        best = jnp.argmin(scores)
+        ratio = jnp.sum(_inliers(estimator, models[:, best], mask)) / jnp.maximum(count, 1)
         required = required_hypotheses(ratio.astype(dtype), m, options.confidence)
-        required = jnp.where(jnp.isfinite(negative[0]), required, jnp.inf)
-        return _State(state.chunk + 1, merged[:, top], -negative, required)
+        required = jnp.where(jnp.isfinite(scores[best]), required, jnp.inf)
+        return _State(state.chunk + 1, models[:, best], scores[best], required)
 
     def unfinished(state: _State) -> Array:
         return (state.chunk < num_chunks) & (state.chunk * k < state.required) & (count >= m)
 
     d = jax.eval_shape(estimator.hypothesize, jax.ShapeDtypeStruct((m, k), jnp.int32))[0].shape[0]
-    state = _State(
-        jnp.zeros((), jnp.int32),
-        jnp.zeros((d, options.top_k), dtype),
-        jnp.full((options.top_k,), jnp.inf, dtype),
-        jnp.asarray(jnp.inf, dtype),
+    start = _State(
+        jnp.zeros((), jnp.int32), jnp.zeros((d,), dtype), jnp.asarray(jnp.inf, dtype), jnp.asarray(jnp.inf, dtype)
     )
-    state = jax.lax.while_loop(unfinished, body, state)
-
-    polished = jax.vmap(lambda model: estimator.polish(model, _inliers(estimator, model, mask)), -1, -1)(state.models)
-    models = jnp.concatenate([polished, state.models], axis=1)
-    found = jnp.tile(jnp.isfinite(state.scores), 2)
-    scores = jnp.where(found, scores_of(models, estimator.observations, weights), jnp.inf)
-    best = jnp.argmin(scores)
-    any_found = found[best]
-    model = jnp.where(any_found, models[:, best], 0.0)
-    inliers = _inliers(estimator, model, mask) & any_found
-    score = jnp.where(any_found, scores[best], count.astype(dtype))
-    return Consensus(model, inliers, score, state.chunk * k)
+    state = jax.lax.while_loop(unfinished, body, start)
+    found = jnp.isfinite(state.score)
+    model = jnp.where(found, state.model, 0.0)
+    inliers = _inliers(estimator, model, mask) & found
+    return Consensus(model, inliers, jnp.where(found, state.score, count.astype(dtype)), state.chunk * k)
 
 
 def _inliers(estimator: Estimator, model: Float[Array, " d"], mask: Bool[Array, " n"]) -> Bool[Array, " n"]:

@@ -16,6 +16,8 @@ from jax.scipy.special import gammaln
 
 from vojax._types import Array, Bool, Float, Int
 
+SQRT_TAU = 2.5066282746310002  # √(2π)
+
 
 def is_significant(
     num_inliers: Int[Array, ""], count: Int[Array, ""], sample_size: int, chance: Float[Array, ""]
@@ -44,3 +46,36 @@ def chance_in_image(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], thresh
     # A box thinner than the disc counts with the disc's width.
     width, height = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold_px)
     return jnp.minimum(jnp.pi * threshold_px**2 / (width * height), 1.0)
+
+
+def chance_near_line(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
+    """Probability that a random pixel lies within the threshold of a line; pixels fill their bounding box.
+
+    A line crosses the box along its diagonal at most.
+    """
+    low = jnp.min(jnp.where(mask[:, None], pixels, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], pixels, -jnp.inf), axis=0)
+    width, height = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold_px)
+    return jnp.minimum(2.0 * threshold_px * jnp.sqrt(width**2 + height**2) / (width * height), 1.0)
+
+
+def even_odds(
+    num_inliers: Int[Array, ""],
+    count: Int[Array, ""],
+    inlier_density: Float[Array, ""],
+    outlier_density: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Error in standard deviations at which an observation is as likely an outlier as an inlier.
+
+    Args:
+        num_inliers: Supporters of the model.
+        count: Observations.
+        inlier_density: Of the errors of inliers at zero: 1/(σ√2π) in one dimension, 1/(2πσ²) in two.
+        outlier_density: Of the errors of outliers, in the same unit.
+
+    References: Torr & Zisserman, "MLESAC", 2000.
+    """
+    share = num_inliers.astype(inlier_density.dtype) / jnp.maximum(count, 1)
+    share = jnp.clip(share, 0.01, 0.99)
+    odds = share * inlier_density / jnp.maximum((1.0 - share) * outlier_density, 1e-30)
+    return jnp.sqrt(2.0 * jnp.log(jnp.clip(odds, 1.7, 1e8)))

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from vojax._numerics import Vector3, cross3, dot3
+from vojax._numerics import complement as complement
 from vojax._types import Array
 
 Components = tuple[Array, ...]
@@ -34,18 +35,6 @@ def sign(x: Array) -> Array:
 def floor(x: Array) -> float:
     """Smallest magnitude whose fourth power is a normal number of the dtype."""
     return float(jnp.finfo(x.dtype).tiny) ** 0.25
-
-
-def complement(unit: Vector3) -> tuple[Vector3, Vector3]:
-    """Two unit vectors that complete a unit vector to an orthonormal, right-handed frame.
-
-    References: T. Duff et al. Building an orthonormal basis, revisited. JCGT 2017.
-    """
-    x, y, z = unit
-    s = sign(z)
-    p = -1.0 / (s + z)
-    xy = x * y * p
-    return (1.0 + s * x * x * p, s * xy, -s * x), (xy, s + y * y * p, -y)
 
 
 def rotate(wxyz: Components, x: Vector3) -> Vector3:

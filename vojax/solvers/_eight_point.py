@@ -117,7 +117,8 @@ def _kernel(rays0: Array, rays1: Array, weights: Array) -> tuple[Array, Array, A
     return jnp.where(valid, unit, 0.0)[None], linear[None], valid[None]
 
 
-_solve = lanes_last(_kernel)
+# On jax 0.12 pieces halve the time (seven points) or take a third off it (eight); on 0.10.1 both stay in their bounds.
+_solve = lanes_last(_kernel, chunk=256)
 
 
 def _candidates(data: Data) -> Candidates[_Model]:

@@ -1,0 +1,126 @@
+"""What the estimators of two images share: noise, normalised pixels, and the search over matrices."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vojax._types import Array, Bool, Float
+from vojax.ba import PixelRays, pixel_rays
+
+
+class Plane(eqx.Module):
+    """A camera for pixels of unknown calibration: moves and scales them to order one, rays have third component one."""
+
+    center: Float[Array, "2"]
+    scale: Float[Array, ""]
+
+    def unproject(self, pixels: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        """Homogeneous coordinates of order one."""
+        x = (pixels - self.center[None]) * self.scale
+        return jnp.concatenate([x, jnp.ones_like(x[:, :1])], axis=1)
+
+    def matrix(self) -> Float[Array, "3 3"]:
+        """The normalisation as a matrix that takes (u, v, 1) to what `unproject` returns."""
+        zero, s = jnp.zeros_like(self.scale), self.scale
+        rows = [[s, zero, -s * self.center[0]], [zero, s, -s * self.center[1]], [zero, zero, jnp.ones_like(s)]]
+        return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def normalising_plane(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"]) -> Plane:
+    """Centre and scale of the pixels that count; constant to differentiation.
+
+    References: Hartley, "In defense of the eight-point algorithm", PAMI 1997.
+    """
+    pixels = jax.lax.stop_gradient(pixels)
+    count = jnp.maximum(jnp.sum(mask), 1).astype(pixels.dtype)
+    center = jnp.sum(jnp.where(mask[:, None], pixels, 0.0), axis=0) / count
+    spread = jnp.sum(jnp.where(mask[:, None], (pixels - center[None]) ** 2, 0.0)) / count
+    return Plane(center, jnp.sqrt(2.0 / jnp.where(spread > 0, spread, 2.0)))
+
+
+def noise_factors(sigma_px: Any, n: int, dtype: Any) -> tuple[Float[Array, "n 2 2"], Float[Array, "n 2 2"]]:
+    """Lower-triangular square roots of the pixel covariances of both views.
+
+    Args:
+        sigma_px: Standard deviation in pixels: one for all `()`, one per correspondence `[n]`, or the covariances of
+            both views `[n, 2, 2, 2]` in px², view first.
+        n: Number of correspondences.
+        dtype: Of the result.
+
+    Raises:
+        ValueError: If the shape of `sigma_px` is none of these.
+    """
+    sigma = jnp.asarray(sigma_px, dtype)
+    if sigma.shape in ((), (n,)):
+        factor = jnp.broadcast_to(sigma[..., None, None] * jnp.eye(2, dtype=dtype), (n, 2, 2))
+        return factor, factor
+    if sigma.shape != (n, 2, 2, 2):
+        raise ValueError(
+            f"sigma_px has shape {sigma.shape}: expected one standard deviation (), one for each correspondence "
+            f"({n},), or the covariances of both views ({n}, 2, 2, 2)"
+        )
+    a = jnp.sqrt(sigma[..., 0, 0])
+    b = sigma[..., 1, 0] / a
+    c = jnp.sqrt(sigma[..., 1, 1] - b * b)
+    factor = jnp.stack([jnp.stack([a, jnp.zeros_like(a)], -1), jnp.stack([b, c], -1)], -2)
+    return factor[:, 0], factor[:, 1]
+
+
+def root_mean_square(sigma_px: Any, mask: Bool[Array, " n"]) -> Float[Array, ""]:
+    """One standard deviation that stands for all, whatever form they come in; constant to differentiation."""
+    sigma = jax.lax.stop_gradient(jnp.asarray(sigma_px))
+    if sigma.ndim == 0:
+        return sigma
+    if sigma.ndim == 1:
+        square = sigma * sigma
+    else:  # covariances: half the trace, averaged over the views if there are two
+        square = jnp.trace(sigma, axis1=-2, axis2=-1) / sigma.shape[-1]
+        square = jnp.mean(square.reshape(mask.shape[0], -1), axis=1)
+    total = jnp.sum(jnp.where(mask, square, 0.0)) / jnp.maximum(jnp.sum(mask), 1)
+    return jnp.sqrt(jnp.where(total > 0, total, 1.0))
+
+
+def pair_rays(pixels0: Array, pixels1: Array, camera0: Any, camera1: Any, sigma_px: Any) -> tuple[PixelRays, PixelRays]:
+    """Rays of both views with their noise."""
+    factor0, factor1 = noise_factors(sigma_px, pixels0.shape[0], pixels0.dtype)
+    return pixel_rays(camera0, pixels0, factor0), pixel_rays(camera1, pixels1, factor1)
+
+
+def checked_pairs(
+    pixels0: Any, pixels1: Any, least: int, what: str, d: int = 2
+) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+    """Arrays of one dtype and of shapes that fit.
+
+    Raises:
+        ValueError: If shapes do not fit or there are fewer rows than a minimal sample has.
+    """
+    first, second = jnp.asarray(pixels0), jnp.asarray(pixels1)
+    name = "pixels" if d == 2 else "points"
+    if first.ndim != 2 or first.shape[1] != d or first.shape != second.shape:
+        raise ValueError(
+            f"{name}0 has shape {first.shape} and {name}1 {second.shape}: expected (n, {d}) both, one row for each "
+            "correspondence"
+        )
+    if first.shape[0] < least:
+        raise ValueError(f"{first.shape[0]} correspondences: {what} needs at least {least}")
+    dtype = jnp.result_type(first, second, jnp.float32)
+    return first.astype(dtype), second.astype(dtype)
+
+
+def masked_pairs(first: Array, second: Array, mask: Any) -> tuple[Array, Array, Bool[Array, " n"]]:
+    """Zeros in rows that do not count or are not finite, and which rows count."""
+    finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
+    mask = finite if mask is None else finite & jnp.asarray(mask)
+    return jnp.where(mask[:, None], first, 0.0), jnp.where(mask[:, None], second, 0.0), mask
+
+
+def single_precision(tree: Any) -> Any:
+    """Constants in float32: what a search works on."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x).astype(jnp.float32), tree)
+
+
+def matrix_rows(models: Float[Array, "9 *lanes"]) -> list[tuple[Array, Array, Array]]:
+    """Rows of 3×3 matrices in the lanes."""
+    return [(models[i], models[i + 1], models[i + 2]) for i in (0, 3, 6)]
