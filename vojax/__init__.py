@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from .robust import Estimate as Estimate
     from .robust import RansacOptions as RansacOptions
     from .robust import estimate_absolute_pose as estimate_absolute_pose
+    from .robust import estimate_fundamental as estimate_fundamental
+    from .robust import estimate_homography as estimate_homography
+    from .robust import estimate_relative_pose as estimate_relative_pose
+    from .robust import estimate_rigid as estimate_rigid
+    from .robust import estimate_similarity as estimate_similarity
 
 _FOLDERS = ("ba", "cameras", "geometry", "lie", "robust", "solvers")
 _HOMES = {
@@ -37,6 +42,11 @@ _HOMES = {
     "Estimate": "robust",
     "RansacOptions": "robust",
     "estimate_absolute_pose": "robust",
+    "estimate_fundamental": "robust",
+    "estimate_homography": "robust",
+    "estimate_relative_pose": "robust",
+    "estimate_rigid": "robust",
+    "estimate_similarity": "robust",
 }
 
 

@@ -105,10 +105,8 @@ def polish_model(start: Model, problem: ModelProblem, *, weight: Float[Array, " 
         zero = jnp.zeros((d,), _dtype(model))
         residual, columns = _linearized(problem.residual, problem, model, zero)
         robust = weight * loss.weight(sum(r * r for r in residual))  # type: ignore[arg-type]
-        sums = sum(
-            jnp.matmul(rows * robust[None], rows.T, precision="highest")
-            for rows in (jnp.concatenate([c, r[None]]) for c, r in zip(columns, residual, strict=True))
-        )
+        rows = [jnp.concatenate([c, r[None]]) for c, r in zip(columns, residual, strict=True)]
+        sums = jnp.sum(jnp.stack([jnp.matmul(x * robust[None], x.T, precision="highest") for x in rows]), axis=0)
         damped = sums[:d, :d] * (1.0 + 1e-4 * jnp.eye(d, dtype=sums.dtype))
         increment, _ = cholesky_solve(damped, -sums[:d, d:])
         return problem.retract(model, increment[:, 0])

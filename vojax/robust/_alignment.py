@@ -51,7 +51,7 @@ class AlignmentEstimator(eqx.Module):
         points0, points1 = (jnp.moveaxis(points[sample], 1, -1) for points in (self.points0, self.points1))
         solver = umeyama if self.with_scale else rigid_three_point
         candidates = jax.vmap(solver, in_axes=-1, out_axes=-1)(points0, points1)
-        parameters = candidates.models.wxyz_xyz_scale if self.with_scale else candidates.models.wxyz_xyz
+        (parameters,) = jax.tree.leaves(candidates.models)
         return _matrix_lanes(parameters[0]), candidates.valid[0]
 
     def squared_error(self, models: Float[Array, "12 *lanes"], observation: tuple[Array, ...]) -> Array:

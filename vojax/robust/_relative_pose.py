@@ -130,9 +130,9 @@ def _estimate(
     pixels0, pixels1, mask = masked_pairs(pixels0, pixels1, mask)
     essential, consensus = search_relative_pose(pixels0, pixels1, camera0, camera1, mask, quality, key, options)
     view0, view1 = pair_rays(pixels0, pixels1, camera0, camera1, sigma_px)
-    rays = [jnp.stack(view.ray, axis=1) for view in (view0, view1)]
+    rays0, rays1 = jax.lax.stop_gradient([jnp.stack(view.ray, axis=1) for view in (view0, view1)])
     weight = consensus.inliers.astype(pixels0.dtype)
-    start, _ = pose_from_essential(jax.lax.stop_gradient(essential), *jax.lax.stop_gradient(rays), weight)
+    start, _ = pose_from_essential(jax.lax.stop_gradient(essential), rays0, rays1, weight)
     start = jax.lax.stop_gradient(start)
     chance = chance_near_line(pixels1, mask, options.threshold_px)
     # All observations take part in the last refinement, weighted by how likely they are inliers: cutting them off at
