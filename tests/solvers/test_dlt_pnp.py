@@ -300,6 +300,7 @@ SLOWLY = pytest.mark.slow
 @pytest.mark.parametrize(
     "method", ["svd", "calibrated", pytest.param("fix_p23", marks=SLOWLY), pytest.param("cross", marks=SLOWLY)]
 )
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64, method):
     function = weighted_sum(method)
     both = jax.jit(lambda *x: (jax.grad(function, (0, 1, 2))(*x), jax.jacfwd(function, (0, 1, 2))(*x)))
@@ -316,6 +317,7 @@ def test_gradients_equal_central_differences(x64, method):
 
 
 @pytest.mark.parametrize("method", ["svd", "calibrated"])
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(method):
     function = weighted_sum(method)
     gradient = jax.jit(jax.vmap(jax.grad(function, (0, 1, 2)), -1, -1))

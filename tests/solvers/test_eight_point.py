@@ -195,6 +195,7 @@ def test_values_are_finite_everywhere(kind, dtype):
 @pytest.mark.parametrize(
     "solver", [eight_point, pytest.param(fundamental_eight_point, marks=pytest.mark.slow)], ids=["rays", "pixels"]
 )
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(solver):
     problems = bearing_problems if solver is eight_point else pixel_problems
     first, second = spoiled(*problems(SIZE, 8, seed=10)[:2], seed=10)
@@ -235,6 +236,7 @@ def weighted_sum(kind):
         pytest.param("fundamental", 12, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.slow
 def test_gradients_equal_central_differences(kind, n, x64):
     # With noise, so that the correction to a matrix of the right kind has a derivative of its own.
     rng = np.random.default_rng(11)

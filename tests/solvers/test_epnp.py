@@ -277,6 +277,7 @@ def total(points, bearings, weights):
     return jnp.sum(epnp(points, bearings, weights).models.wxyz_xyz[0] * jnp.arange(1.0, 8.0))
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     # With noise, so that the curvature of the residuals counts.
     both = jax.jit(lambda *x: (jax.grad(total, (0, 1, 2))(*x), jax.jacfwd(total, (0, 1, 2))(*x)))
@@ -292,12 +293,14 @@ def test_gradients_equal_central_differences(x64):
                 np.testing.assert_allclose(ahead, back, rtol=1e-9, atol=1e-9 * np.abs(back).max())
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     gradient = jax.jit(jax.vmap(jax.grad(total, (0, 1, 2)), -1, -1))
     for part in gradient(*lanes(*mixed(2048, 8, seed=14, padded=8), dtype=np.float32)):
         assert np.isfinite(part).all()
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     data, *_ = problems(2048, N, seed=15, sigma=1e-3)
     batch = solve(data, np.float64).models.wxyz_xyz

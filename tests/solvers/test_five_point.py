@@ -232,6 +232,7 @@ def weighted_sum():
     return jax.jit(function), jax.jit(jax.grad(function, (0, 1))), jax.jit(jax.jacfwd(function, (0, 1)))
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     function, reverse, forward = weighted_sum()
     rays0, rays1, *_ = relative_pose_problems(3, 5, seed=11)

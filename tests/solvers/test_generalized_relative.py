@@ -148,6 +148,7 @@ def test_nothing_is_ever_infinite(dtype):
         assert np.isfinite(solve(mixed(seed, 125_000), dtype).models.wxyz_xyz).all()
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     data, *_ = problems(1, 11, sigma=3e-4)
     assert_derivatives(generalized_relative_pose, solve_last, [x[0] for x in data])

@@ -151,6 +151,7 @@ def test_nothing_is_ever_infinite(dtype):
         assert np.isfinite(solve(mixed(seed, 125_000), dtype).models.wxyz_xyz).all()
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     assert_derivatives(gp3p, solve_last, [x[0] for x in problems(1, 11)[:3]])
 

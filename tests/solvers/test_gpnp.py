@@ -138,6 +138,7 @@ def test_nothing_is_ever_infinite(dtype):
         assert np.isfinite(solve(mixed(seed, 125_000), dtype).models.wxyz_xyz).all()
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     data, *_ = problems(1, N, 11, sigma=3e-3)
     assert_derivatives(gpnp, solve_last, [x[0] for x in data])

@@ -188,6 +188,7 @@ def test_coincident_points(method):
     np.testing.assert_array_equal(result.result._value, Result.degenerate._value)
 
 
+@pytest.mark.slow
 def test_gradient_for_given_matches(x64):
     rng = np.random.default_rng(10)
     points1, normals = surface(rng, 1, 60)

@@ -81,6 +81,7 @@ def test_mask_leaves_correspondences_out(x64):
     assert none.inlier_share == 0.0
 
 
+@pytest.mark.slow
 def test_gradient_of_the_vote(x64):
     world = drive(1, 40, seed=29, theta=0.1, outliers=0.25, sigma=2e-4, mounted=True)
     data = [world[x][0] for x in ("rays0", "rays1", "forward", "up")]

@@ -274,6 +274,7 @@ def weighted_sum():
     return jax.jit(function), jax.jit(jax.grad(function, (0, 1))), jax.jit(jax.jacfwd(function, (0, 1)))
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     function, reverse, forward = weighted_sum()
     points, bearings, *_ = absolute_pose_problems(5, seed=11)
@@ -355,6 +356,7 @@ def test_nothing_to_choose_from(x64):
         np.testing.assert_array_equal(best.models.wxyz_xyz, np.broadcast_to(np.eye(7)[0], (64, 1, 7)))
 
 
+@pytest.mark.slow
 def test_gradient_of_the_chosen_pose(x64):
     points, bearings, *_ = four_points(1, seed=19)
 

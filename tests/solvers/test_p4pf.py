@@ -161,7 +161,8 @@ def test_nothing_is_ever_infinite(dtype):
             assert np.isfinite(x).all()
 
 
-@pytest.mark.parametrize("sigma", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64, sigma):
     points, pixels, *_ = problems(1, 11, sigma=sigma)
     assert_derivatives(p4pf, solve_last, (points[0], pixels[0]), rtol=1e-6 if sigma == 0 else 1e-5)

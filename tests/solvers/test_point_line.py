@@ -158,6 +158,7 @@ def test_nothing_is_ever_infinite(dtype):
         assert np.isfinite(solve(mixed(seed, 125_000), dtype).models.wxyz_xyz).all()
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     data, *_ = problems(1, 11)
     assert_derivatives(p3l, lines_last, (data[2][0], data[3][0]))

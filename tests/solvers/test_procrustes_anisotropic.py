@@ -241,6 +241,7 @@ def symmetric_sum(points0, points1, half0, half1):
     return weighted_sum(points0, points1, half0 @ jnp.swapaxes(half0, 1, 2), half1 @ jnp.swapaxes(half1, 1, 2))
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     (x, y, c0, c1), *_ = random_problems(1, 4, sigma=0.05, seed=11)
     check_gradients(symmetric_sum, [(x[0], y[0], np.linalg.cholesky(c0[0]), np.linalg.cholesky(c1[0]))])

@@ -140,6 +140,7 @@ def test_impossible_problems_have_no_valid_slot(spoil, dtype):
     assert not solve_in_batches(solve_last, first, second, dtype=dtype, size=SIZE).valid.any()
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite_everywhere(dtype):
     first, second = spoiled(*bearing_problems(SIZE, 6, seed=9)[:2], seed=9)
     assert_finite_with_zero_placeholders(solve_in_batches(solve_last, first, second, dtype=dtype, size=SIZE))
@@ -166,6 +167,7 @@ def weighted_sum():
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4])
+@pytest.mark.slow
 def test_gradients_equal_central_differences(noise, x64):
     function, reverse, forward = weighted_sum()
     rng = np.random.default_rng(10)
@@ -179,6 +181,7 @@ def test_gradients_equal_central_differences(noise, x64):
             np.testing.assert_allclose(ahead, back, rtol=1e-8, atol=1e-8 * size)
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     first, second, _ = bearing_problems(4, 6, seed=11)
     last = solve_in_batches(solve_last, first, second, dtype=np.float64, size=SIZE)
@@ -188,6 +191,7 @@ def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
         np.testing.assert_allclose(six_point(first[i], second[i]).models, last.models[i], atol=1e-11)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     many, _ = errors_of(65_536, np.float32, seed=12, size=65_536)
     few, _ = errors_of(65_536, np.float32, seed=12)

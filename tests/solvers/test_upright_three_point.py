@@ -157,6 +157,7 @@ def test_degenerate_problems_give_finite_placeholders(dtype):
     )
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     check_gradients(upright_three_point, upright_problems(16, 3, seed=11)[0], 4)
 

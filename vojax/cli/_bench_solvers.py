@@ -135,6 +135,7 @@ def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
         "p5pfr": (solvers.p5pfr, lambda: unknown_focal(5), 1460.0),
         "p3l": (solvers.p3l, lambda: lines(3), None),
         "p2p1l": (solvers.p2p1l, lambda: (*pose(2), *lines(1)), None),
+        "p1p2l": (solvers.p1p2l, lambda: (*pose(1), *lines(2)), None),
     }
     return {name: Problem(*entry) for name, entry in table.items()}
 
