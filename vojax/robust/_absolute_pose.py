@@ -10,16 +10,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vojax._result import Result
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from vojax.ba import Cauchy, LMOptions, polish_absolute_pose, refine_absolute_pose
 from vojax.lie import SE3, SO3
 from vojax.solvers import p3p
 
+from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._significance import chance_in_image, is_significant
+from ._pairs import masked_pairs, matrix_lanes
+from ._significance import chance_in_image
 
 
 class AbsolutePoseEstimator(eqx.Module):
@@ -44,7 +45,7 @@ class AbsolutePoseEstimator(eqx.Module):
         bearings = jnp.moveaxis(self.bearings[sample], 1, -1)
         candidates = jax.vmap(p3p, in_axes=-1, out_axes=-1)(points, bearings)
         parameters = jnp.moveaxis(candidates.models.wxyz_xyz, 1, 0).reshape(7, -1)
-        return _matrix_lanes(parameters), candidates.valid.reshape(-1)
+        return matrix_lanes(parameters), candidates.valid.reshape(-1)
 
     def squared_error(self, models: Float[Array, "12 *lanes"], observation: tuple[Array, ...]) -> Array:
         """Squared reprojection error in px²; points behind the camera are infinitely wrong."""
@@ -67,18 +68,7 @@ class AbsolutePoseEstimator(eqx.Module):
             loss=Cauchy(),
             steps=self.local_steps,
         )
-        return _matrix_lanes(refined.wxyz_xyz)
-
-
-def _matrix_lanes(parameters: Float[Array, "7 *lanes"]) -> Float[Array, "12 *lanes"]:
-    """[R | t] from quaternion and translation, in the lanes."""
-    w, x, y, z, tx, ty, tz = parameters
-    xx, yy, zz = x * x, y * y, z * z
-    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
-    row0 = [1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy), tx]
-    row1 = [2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx), ty]
-    row2 = [2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy), tz]
-    return jnp.stack([*row0, *row1, *row2])
+        return matrix_lanes(refined.wxyz_xyz)
 
 
 def _pose(model: Float[Array, "12"]) -> SE3:
@@ -158,10 +148,7 @@ def _estimate(
     quality: Any,
     mask: Any,
 ) -> Estimate[SE3]:
-    finite = jnp.all(jnp.isfinite(points_world), axis=1) & jnp.all(jnp.isfinite(pixels), axis=1)
-    mask = finite if mask is None else finite & jnp.asarray(mask)
-    points_world = jnp.where(mask[:, None], points_world, 0.0)
-    pixels = jnp.where(mask[:, None], pixels, 0.0)
+    points_world, pixels, mask = masked_pairs(points_world, pixels, mask)
     count = jnp.sum(mask)
 
     # Poses are solved about the centre of the points, wherever the world's origin is.
@@ -179,25 +166,20 @@ def _estimate(
         mask=consensus.inliers,
         options=LMOptions(max_steps=options.final_steps),
     )
-    inliers, score = _judge(refined.model, centered, pixels, camera, mask, options)
-    num_inliers = jnp.sum(inliers)
-    agreed = is_significant(num_inliers, count, 3, chance_in_image(pixels, mask, options.threshold_px))
-    result = Result.where(agreed, refined.result, Result.no_consensus)
-    # Where not one sample could be solved, it is the observations that are at fault.
-    result = Result.where(jnp.any(consensus.model != 0), result, Result.degenerate)
-    result = Result.where(count >= 4, result, Result.too_few)
-    usable = (result == Result.success) | (result == Result.not_converged)
+    points_cam = refined.model.apply(centered)
+    error = camera.project(points_cam) - pixels
     shift = SE3.from_rotation_and_translation(SO3.identity(dtype=dtype), -center)
-    model = refined.model @ shift
-    model = SE3(jnp.where(usable, model.wxyz_xyz, SE3.identity(dtype=dtype).wxyz_xyz))
-    return Estimate(
-        model,
-        inliers & usable,
-        jnp.where(usable, num_inliers, 0),
-        jnp.where(usable, score, count.astype(dtype)),
-        consensus.num_hypotheses,
-        jnp.where(usable, refined.covariance, 0.0),
-        result,
+    return conclude(
+        refined.model @ shift,
+        refined.covariance,
+        refined.result,
+        jnp.where(points_cam[:, 2] > 0, jnp.sum(error * error, axis=1), jnp.inf),
+        placeholder=SE3.identity(dtype=dtype),
+        consensus=consensus,
+        mask=mask,
+        sample_size=3,
+        chance=chance_in_image(pixels, mask, options.threshold_px),
+        limit=options.threshold_px**2,
     )
 
 
@@ -232,15 +214,3 @@ def search_absolute_pose(
     quality = None if quality is None else jax.lax.stop_gradient(jnp.asarray(quality))
     consensus = search(estimator, mask, quality, key, options)
     return SE3(_pose(consensus.model).wxyz_xyz.astype(points_world.dtype)), consensus
-
-
-def _judge(
-    model: SE3, points: Array, pixels: Array, camera: Any, mask: Array, options: RansacOptions
-) -> tuple[Array, Array]:
-    """Inliers and score at a pose, in the caller's precision; constants to differentiation."""
-    model, points, pixels, camera = jax.lax.stop_gradient((model, points, pixels, camera))
-    points_cam = model.apply(points)
-    error = camera.project(points_cam) - pixels
-    squared = jnp.where(points_cam[:, 2] > 0, jnp.sum(error * error, axis=1), jnp.inf)
-    limit = options.threshold_px**2
-    return mask & (squared <= limit), jnp.sum(jnp.where(mask, jnp.minimum(squared / limit, 1.0), 0.0))

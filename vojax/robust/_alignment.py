@@ -27,8 +27,8 @@ from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import checked_pairs, masked_pairs, root_mean_square, single_precision
-from ._significance import SQRT_TAU, even_odds
+from ._pairs import checked_pairs, masked_pairs, matrix_lanes, root_mean_square, single_precision
+from ._significance import SQRT_TAU, chance_in_box, even_odds
 
 
 class AlignmentEstimator(eqx.Module):
@@ -52,7 +52,7 @@ class AlignmentEstimator(eqx.Module):
         solver = umeyama if self.with_scale else rigid_three_point
         candidates = jax.vmap(solver, in_axes=-1, out_axes=-1)(points0, points1)
         (parameters,) = jax.tree.leaves(candidates.models)
-        return _matrix_lanes(parameters[0]), candidates.valid[0]
+        return matrix_lanes(parameters[0]), candidates.valid[0]
 
     def squared_error(self, models: Float[Array, "12 *lanes"], observation: tuple[Array, ...]) -> Array:
         """Squared distance."""
@@ -71,25 +71,7 @@ class AlignmentEstimator(eqx.Module):
         loss = Tukey(2.0 * self.limit**0.5)
         weight = mask.astype(model.dtype)
         start = _motion(model, self.with_scale)
-        return _entries(polish_model(start, problem, weight=weight, loss=loss, steps=self.local_steps))
-
-
-def _matrix_lanes(parameters: Float[Array, "p *lanes"]) -> Float[Array, "12 *lanes"]:
-    """[s R | t] from quaternion, translation and perhaps scale, in the lanes."""
-    w, x, y, z, *rest = parameters
-    s = rest[3] if len(rest) > 3 else jnp.ones_like(w)
-    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
-    return jnp.stack(
-        [
-            *(s * (1 - 2 * (yy + zz)), s * 2 * (xy - wz), s * 2 * (xz + wy), rest[0]),
-            *(s * 2 * (xy + wz), s * (1 - 2 * (xx + zz)), s * 2 * (yz - wx), rest[1]),
-            *(s * 2 * (xz - wy), s * 2 * (yz + wx), s * (1 - 2 * (xx + yy)), rest[2]),
-        ]
-    )
-
-
-def _entries(motion: SE3 | Sim3) -> Float[Array, "12"]:
-    return _matrix_lanes(motion.parameters())
+        return matrix_lanes(polish_model(start, problem, weight=weight, loss=loss, steps=self.local_steps).parameters())
 
 
 def _motion(entries: Float[Array, "12"], with_scale: bool) -> SE3 | Sim3:
@@ -204,7 +186,7 @@ def _estimate(
     start = jax.tree.map(lambda x: x.astype(dtype), _motion(consensus.model, with_scale))
 
     kind = SimilarityProblem if with_scale else RigidProblem
-    chance = _chance_in_box(y, mask, options.threshold)
+    chance = chance_in_box(y, mask, options.threshold)
     level = root_mean_square(sigma, mask).astype(dtype)
     ball = 4.0 / 3.0 * jnp.pi * options.threshold**3
     cut = even_odds(jnp.sum(consensus.inliers), jnp.sum(mask), 1.0 / (SQRT_TAU * level) ** 3, chance / ball)
@@ -234,11 +216,3 @@ def _estimate(
         chance=chance,
         limit=options.threshold**2,
     )
-
-
-def _chance_in_box(points: Float[Array, "n 3"], mask: Bool[Array, " n"], threshold: float) -> Float[Array, ""]:
-    """Probability that a random point lies within the threshold of another; points fill their bounding box."""
-    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
-    size = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold)
-    return jnp.minimum(4.0 / 3.0 * jnp.pi * threshold**3 / jnp.prod(size), 1.0)

@@ -29,7 +29,7 @@ def conclude(
     """Put an estimate together.
 
     Args:
-        model: Refined on the inliers of the consensus.
+        model: After the last refinement.
         covariance: Of its tangent.
         refined: How the refinement ended.
         squared_error: Of the observations at the refined model; large where impossible.

@@ -1,4 +1,4 @@
-"""What the estimators of two images share: noise, normalised pixels, and the search over matrices."""
+"""What the estimators share: checks and masks, noise, normalised pixels, and models as numbers in the lanes."""
 
 from typing import Any
 
@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import cholesky_factor
 from vojax._types import Array, Bool, Float
 from vojax.ba import PixelRays, pixel_rays
 
@@ -61,10 +62,9 @@ def noise_factors(sigma_px: Any, n: int, dtype: Any) -> tuple[Float[Array, "n 2 
             f"sigma_px has shape {sigma.shape}: expected one standard deviation (), one for each correspondence "
             f"({n},), or the covariances of both views ({n}, 2, 2, 2)"
         )
-    a = jnp.sqrt(sigma[..., 0, 0])
-    b = sigma[..., 1, 0] / a
-    c = jnp.sqrt(sigma[..., 1, 1] - b * b)
-    factor = jnp.stack([jnp.stack([a, jnp.zeros_like(a)], -1), jnp.stack([b, c], -1)], -2)
+    (first, second), _, _ = cholesky_factor(jnp.moveaxis(sigma, (-2, -1), (0, 1)))
+    rows = [[first[0], jnp.zeros_like(first[0])], [first[1], second[0]]]
+    factor = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
     return factor[:, 0], factor[:, 1]
 
 
@@ -124,3 +124,17 @@ def single_precision(tree: Any) -> Any:
 def matrix_rows(models: Float[Array, "9 *lanes"]) -> list[tuple[Array, Array, Array]]:
     """Rows of 3×3 matrices in the lanes."""
     return [(models[i], models[i + 1], models[i + 2]) for i in (0, 3, 6)]
+
+
+def matrix_lanes(parameters: Float[Array, "p *lanes"]) -> Float[Array, "12 *lanes"]:
+    """[s R | t] from quaternion, translation and perhaps scale, in the lanes."""
+    w, x, y, z, *rest = parameters
+    s = rest[3] if len(rest) > 3 else jnp.ones_like(w)
+    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    return jnp.stack(
+        [
+            *(s * (1 - 2 * (yy + zz)), s * 2 * (xy - wz), s * 2 * (xz + wy), rest[0]),
+            *(s * 2 * (xy + wz), s * (1 - 2 * (xx + zz)), s * 2 * (yz - wx), rest[1]),
+            *(s * 2 * (xz - wy), s * 2 * (yz + wx), s * (1 - 2 * (xx + yy)), rest[2]),
+        ]
+    )

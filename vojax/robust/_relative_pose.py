@@ -177,7 +177,8 @@ def in_front(cam1_from_cam0: SE3, view0: PixelRays, view1: PixelRays) -> Bool[Ar
     q, shift = view1.ray, (t[0], t[1], t[2])
     normal = cross3(p, q)
     distance0, distance1 = dot3(normal, cross3(q, shift)), dot3(normal, cross3(p, shift))
-    noise = sum(dot3(x, x) for view in (view0, view1) for x in (view.by_u, view.by_v))  # both, both directions
+    # The variance of the angle between the rays, summed over both views; below 3 deviations (√8) it means nothing.
+    noise = sum(dot3(x, x) for view in (view0, view1) for x in (view.by_u, view.by_v))
     far = (dot3(normal, normal) < 8.0 * noise) & (dot3(p, q) > 0)
     return far | ((distance0 > 0) & (distance1 > 0))
 

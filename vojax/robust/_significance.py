@@ -41,11 +41,7 @@ def is_significant(
 
 def chance_in_image(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
     """Probability that a random pixel lies within the threshold of another; pixels fill their bounding box."""
-    low = jnp.min(jnp.where(mask[:, None], pixels, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], pixels, -jnp.inf), axis=0)
-    # A box thinner than the disc counts with the disc's width.
-    width, height = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold_px)
-    return jnp.minimum(jnp.pi * threshold_px**2 / (width * height), 1.0)
+    return jnp.minimum(jnp.pi * threshold_px**2 / jnp.prod(_box(pixels, mask, threshold_px)), 1.0)
 
 
 def chance_near_line(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
@@ -53,10 +49,20 @@ def chance_near_line(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], thres
 
     A line crosses the box along its diagonal at most.
     """
-    low = jnp.min(jnp.where(mask[:, None], pixels, jnp.inf), axis=0)
-    high = jnp.max(jnp.where(mask[:, None], pixels, -jnp.inf), axis=0)
-    width, height = jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold_px)
-    return jnp.minimum(2.0 * threshold_px * jnp.sqrt(width**2 + height**2) / (width * height), 1.0)
+    size = _box(pixels, mask, threshold_px)
+    return jnp.minimum(2.0 * threshold_px * jnp.sqrt(jnp.sum(size**2)) / jnp.prod(size), 1.0)
+
+
+def chance_in_box(points: Float[Array, "n 3"], mask: Bool[Array, " n"], threshold: float) -> Float[Array, ""]:
+    """Probability that a random point lies within the threshold of another; points fill their bounding box."""
+    return jnp.minimum(4.0 / 3.0 * jnp.pi * threshold**3 / jnp.prod(_box(points, mask, threshold)), 1.0)
+
+
+def _box(points: Float[Array, "n d"], mask: Bool[Array, " n"], threshold: float) -> Float[Array, "d"]:
+    """Size of the bounding box; one thinner than a disc of the threshold counts with the disc's width."""
+    low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
+    high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)
+    return jnp.maximum(jnp.where(jnp.isfinite(high - low), high - low, 0.0), 2.0 * threshold)
 
 
 def even_odds(
