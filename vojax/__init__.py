@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .robust import RansacOptions as RansacOptions
     from .robust import estimate_absolute_pose as estimate_absolute_pose
     from .robust import estimate_fundamental as estimate_fundamental
+    from .robust import estimate_generalized_pose as estimate_generalized_pose
     from .robust import estimate_homography as estimate_homography
     from .robust import estimate_relative_pose as estimate_relative_pose
     from .robust import estimate_rigid as estimate_rigid
@@ -43,6 +44,7 @@ _HOMES = {
     "RansacOptions": "robust",
     "estimate_absolute_pose": "robust",
     "estimate_fundamental": "robust",
+    "estimate_generalized_pose": "robust",
     "estimate_homography": "robust",
     "estimate_relative_pose": "robust",
     "estimate_rigid": "robust",

@@ -4,9 +4,12 @@ Everything here is elementwise over arrays of any equal shape, so the same code 
 the last axis.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ._types import Array, Bool, Float
 
@@ -41,6 +44,34 @@ def normalize(x: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
 
 
 Vector3 = Sequence[Array]
+
+
+def lane_sum(x: Float[Array, "..."], axis: int | tuple[int, ...]) -> Float[Array, "..."]:
+    """Sum over axes that are not lanes, which XLA may make part of a kernel.
+
+    From jax 0.12 on XLA takes every float32 sum for a call into a library of its own, at the price of a kernel before
+    and one behind it. Rounding to the precision that the numbers have anyway keeps it from seeing one.
+    """
+    axes = (axis,) if isinstance(axis, int) else axis
+    return _sum_over(tuple(a % x.ndim for a in axes))(x)
+
+
+@functools.cache
+def _sum_over(axes: tuple[int, ...]) -> Callable[[Array], Array]:
+    @jax.custom_jvp
+    def total(x: Array) -> Array:
+        info = jnp.finfo(x.dtype)
+
+        def add(a: Array, b: Array) -> Array:
+            return jax.lax.reduce_precision(a + b, info.nexp, info.nmant)
+
+        return jax.lax.reduce(x, np.zeros((), x.dtype), add, axes)
+
+    @total.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        return total(primals[0]), jnp.sum(tangents[0], axis=axes)
+
+    return total
 
 
 def dot3(a: Vector3, b: Vector3) -> Array:
@@ -98,9 +129,14 @@ def cholesky_factor(matrix: Float[Array, "d d *lanes"]) -> tuple[list[Array], li
 
 
 def cholesky_solve(
-    matrix: Float[Array, "d d *lanes"], rhs: Float[Array, "d r *lanes"]
+    matrix: Float[Array, "d d *lanes"], rhs: Float[Array, "d r *lanes"], total: Callable[..., Array] = jnp.sum
 ) -> tuple[Float[Array, "d r *lanes"], Bool[Array, "*lanes"]]:
     """Solve small symmetric positive definite systems; see `cholesky_factor` for singular ones.
+
+    Args:
+        matrix: Of the systems.
+        rhs: Right-hand sides.
+        total: How sums are taken: `lane_sum` within a kernel, which is not for solving for derivatives.
 
     Returns:
         The solutions, and the mask of systems that are regular.
@@ -114,19 +150,21 @@ def cholesky_solve(
         forward.append(entry)
     solution = jnp.zeros_like(rhs[:0])
     for column, inverse, entry in zip(columns[::-1], inverse_pivots[::-1], forward[::-1], strict=True):
-        entry = (entry - jnp.sum(column[1:, None] * solution, axis=0)) * inverse[None]
+        entry = (entry - total(column[1:, None] * solution, axis=0)) * inverse[None]
         solution = jnp.concatenate([entry[None], solution])
     return solution, regular
 
 
-def symmetric_inverse(matrix: Float[Array, "d d *lanes"]) -> tuple[Float[Array, "d d *lanes"], Bool[Array, "*lanes"]]:
+def symmetric_inverse(
+    matrix: Float[Array, "d d *lanes"], total: Callable[..., Array] = jnp.sum
+) -> tuple[Float[Array, "d d *lanes"], Bool[Array, "*lanes"]]:
     """Invert small positive definite matrices, and say which could be inverted.
 
     A matrix is singular to working precision when, scaled to unit diagonal, its condition number exceeds 1/(32 eps),
     3e5 in float32: beyond, rounding in its entries decides a direction (points on a line reach 2e6 and more).
     """
     identity = jnp.eye(matrix.shape[0], dtype=matrix.dtype).reshape(matrix.shape[:2] + (1,) * (matrix.ndim - 2))
-    inverse, regular = cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape))
+    inverse, regular = cholesky_solve(matrix, jnp.broadcast_to(identity, matrix.shape), total)
     # The trace of the scaled inverse bounds its largest eigenvalue.
     trace = sum(matrix[i, i] * inverse[i, i] for i in range(matrix.shape[0]))
     return inverse, regular & (trace < 1.0 / (32.0 * float(jnp.finfo(matrix.dtype).eps)))

@@ -112,17 +112,20 @@ def test_order_puts_the_best_valid_observations_first():
 
 
 def test_the_guided_pool_grows_like_prosacs():
-    count, m, total = 50, 3, 2000
-    sizes = np.asarray(guided_pool(jnp.arange(total), jnp.asarray(count), m, total))
-    assert np.all(np.diff(sizes) >= 0)
-    assert sizes[0] == m + 1
-    assert sizes[-1] == count
+    count, m, total = 50, 3, 200_000
+    drawn = jnp.arange(total)
+    sizes = np.asarray(guided_pool(drawn, jnp.asarray(count), m))
+    assert np.all(sizes[3::4] == count)  # every fourth is not guided
+    guided, drawn = sizes[np.arange(total) % 4 != 3], np.arange(total)[np.arange(total) % 4 != 3]
+    assert np.all(np.diff(guided) >= 0)
+    assert guided[0] == m + 1
+    assert guided[-1] == count
     # T_n = T_N C(n, m)/C(N, m) in the paper; (n/N)^m is its approximation, so sizes differ by few observations.
     n = np.arange(m + 1, count + 1)
     growth = total * scipy.special.comb(n, m) / scipy.special.comb(count, m)
-    paper = np.minimum(n[np.minimum(np.searchsorted(growth, np.arange(1, total + 1)), len(n) - 1)], count)
-    assert np.abs(sizes - paper).max() <= m
-    assert np.all(np.asarray(guided_pool(jnp.arange(10), jnp.asarray(2), m, 10)) == 2)
+    paper = np.minimum(n[np.minimum(np.searchsorted(growth, drawn + 1), len(n) - 1)], count)
+    assert np.abs(guided - paper).max() <= m
+    assert np.all(np.asarray(guided_pool(jnp.arange(10), jnp.asarray(2), m)) == 2)
 
 
 def test_random_numbers_depend_on_key_and_chunk_only():

@@ -1,5 +1,13 @@
 from ._alignment import RigidProblem as RigidProblem
 from ._alignment import SimilarityProblem as SimilarityProblem
+from ._bundle import BundleAdjustment as BundleAdjustment
+from ._bundle import adjust_bundle as adjust_bundle
+from ._bundle_covariance import BundleCovariance as BundleCovariance
+from ._bundle_covariance import bundle_covariance as bundle_covariance
+from ._bundle_problem import BundleProblem as BundleProblem
+from ._bundle_problem import bundle_problem as bundle_problem
+from ._bundle_residual import BundlePriors as BundlePriors
+from ._bundle_solver import BundleTrace as BundleTrace
 from ._levenberg_marquardt import LMOptions as LMOptions
 from ._losses import Barron as Barron
 from ._losses import Cauchy as Cauchy
@@ -18,6 +26,10 @@ from ._model_refinement import refine_model as refine_model
 from ._refinement import Refinement as Refinement
 from ._refinement import polish_absolute_pose as polish_absolute_pose
 from ._refinement import refine_absolute_pose as refine_absolute_pose
+from ._rig_pose import LocalRigPoseProblem as LocalRigPoseProblem
+from ._rig_pose import RigPoseProblem as RigPoseProblem
+from ._rig_pose import local_error as local_error
+from ._rig_pose import local_forms as local_forms
 from ._two_view import FundamentalProblem as FundamentalProblem
 from ._two_view import HomographyProblem as HomographyProblem
 from ._two_view import PixelRays as PixelRays

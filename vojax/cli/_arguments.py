@@ -69,6 +69,24 @@ class Eval:
 
 
 @dataclasses.dataclass(frozen=True)
+class Ba:
+    """Adjust the cameras and points of a reconstruction together, and write it, a report and a picture."""
+
+    file: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """A BAL problem, or the folder of a COLMAP model (text or binary)."""
+    format: Literal["bal", "colmap"]
+    """Of the file."""
+    out: pathlib.Path
+    """Folder for the results; made where it does not exist."""
+    loss: Literal["squared", "huber", "cauchy"] = "squared"
+    """Robust loss of a residual, in pixels."""
+    max_steps: Annotated[int, tyro.conf.arg(metavar="N")] = 50
+    """Most iterations."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Precision."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Bench:
     """Measure the speed of vojax on this machine: run it while nothing else computes."""
 
@@ -87,11 +105,12 @@ class Help:
     """The user asked for help and has read it."""
 
 
-Command = Demo | Run | Eval | Bench
-_COMMANDS = ("demo", "run", "eval", "bench")
+Command = Demo | Run | Eval | Ba | Bench
+_COMMANDS = ("demo", "run", "eval", "ba", "bench")
 _Choice = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Ba, tyro.conf.subcommand("ba")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

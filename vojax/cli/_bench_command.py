@@ -1,5 +1,7 @@
 """`vojax bench`: measure vojax on this machine."""
 
+import contextlib
+import os
 import platform
 from typing import Any
 
@@ -19,17 +21,27 @@ def execute(command: Bench) -> None:
     """Measure, print a table and, where asked, write the numbers."""
     if command.batch < 1:
         raise ValueError(f"the batch is {command.batch}; expected at least 1")
+    _use_every_core()
     console = Console()
     if not console.is_terminal:
-        console = Console(width=120)  # a file has room for whole names
+        console = Console(width=140)  # a file has room for whole names
     rows = _solver_rows(command, console)
     print_line(console, f"{command.what}, batch {command.batch}, {_machine()}")
     table = Table()
-    for name in ("solver", "dtype", "ns per solve", "fastest", "compile s", "PoseLib C++, published"):
+    for name in (
+        "solver",
+        "dtype",
+        "ns per solve",
+        "split over devices",
+        "fastest",
+        "compile s",
+        "PoseLib C++, published",
+    ):
         table.add_column(name, justify="left" if name in ("solver", "dtype") else "right", no_wrap=True)
     for row in rows:
         peer = "" if row.poselib_ns is None else f"{row.poselib_ns:.0f}"
-        numbers = (f"{row.nanoseconds:.0f}", f"{row.best:.0f}", f"{row.compile_seconds:.1f}", peer)
+        sharded = "" if row.sharded is None else f"{row.sharded:.0f}"
+        numbers = (f"{row.nanoseconds:.0f}", sharded, f"{row.best:.0f}", f"{row.compile_seconds:.1f}", peer)
         table.add_row(row.name, row.dtype, *numbers)
     console.print(table)
     if command.json is not None:
@@ -52,9 +64,17 @@ def _solver_rows(command: Bench, console: Console) -> list[Row]:
     ]
 
 
+def _use_every_core() -> None:
+    """Make each core a device of its own, so that kernels that run on one thread can be measured on all of them."""
+    # Too late where something used JAX before.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+
+
 def _machine() -> str:
     device = jax.devices()[0]
-    return f"jax {jax.__version__}, {device.platform}, {platform.machine()}, Python {platform.python_version()}"
+    devices = f"{len(jax.devices())} {device.platform} devices"
+    return f"jax {jax.__version__}, {devices}, {platform.machine()}, Python {platform.python_version()}"
 
 
 def _numbers(command: Bench, rows: list[Row]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vojax import solvers
 
@@ -35,7 +36,8 @@ class Row(NamedTuple):
     Attributes:
         name: Of the solver and its sample.
         dtype: Of the arrays.
-        nanoseconds: Per solve, median of the repeats.
+        nanoseconds: Per solve in one call on one device, median of the repeats.
+        sharded: Per solve with the batch split over the devices, median; None where there is only one.
         best: Per solve, the fastest repeat.
         compile_seconds: Tracing and compilation.
         poselib_ns: Published nanoseconds per solve of the peer, or None.
@@ -44,6 +46,7 @@ class Row(NamedTuple):
     name: str
     dtype: str
     nanoseconds: float
+    sharded: float | None
     best: float
     compile_seconds: float
     poselib_ns: float | None
@@ -142,23 +145,48 @@ def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
 
 def measure(name: str, problem: Problem, dtype: str, seconds: float = 1.0) -> Row:
     """Compile a batched solver and time it."""
+    devices = jax.devices()
     with jax.enable_x64(dtype == "float64"):
         lanes = [np.ascontiguousarray(np.moveaxis(x, 0, -1).astype(dtype)) for x in problem.arguments()]
-        arguments = [jax.device_put(x) for x in lanes]
-        batched = jax.jit(jax.vmap(problem.solver, in_axes=-1, out_axes=-1))
+        batch = lanes[0].shape[-1]
+        batched = jax.vmap(problem.solver, in_axes=-1, out_axes=-1)
+        times, compile_seconds = _times(batched, [jax.device_put(x) for x in lanes], seconds)
+        sharded = None
+        if len(devices) > 1:
+            whole = batch - batch % len(devices)
+            shared, _ = _times(*_split(batched, [x[..., :whole] for x in lanes]), seconds)
+            sharded = float(np.median(shared)) * 1e9 / whole
+    nanoseconds, best = float(np.median(times)) * 1e9 / batch, min(times) * 1e9 / batch
+    return Row(name, dtype, nanoseconds, sharded, best, compile_seconds, problem.poselib_ns)
+
+
+def _times(function: Callable[..., Any], arguments: list[Any], seconds: float) -> tuple[list[float], float]:
+    """Times of repeated calls, and that of tracing and compilation."""
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - start
+    call = functools.partial(compiled, *arguments)
+    jax.block_until_ready(call())
+    times: list[float] = []
+    begin = time.perf_counter()
+    while len(times) < 5 or time.perf_counter() - begin < seconds:
         start = time.perf_counter()
-        compiled = batched.lower(*arguments).compile()
-        compile_seconds = time.perf_counter() - start
-        call = functools.partial(compiled, *arguments)
         jax.block_until_ready(call())
-        times: list[float] = []
-        begin = time.perf_counter()
-        while len(times) < 5 or time.perf_counter() - begin < seconds:
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            times.append(time.perf_counter() - start)
-    scale = 1e9 / lanes[0].shape[-1]
-    return Row(name, dtype, float(np.median(times)) * scale, min(times) * scale, compile_seconds, problem.poselib_ns)
+        times.append(time.perf_counter() - start)
+    return times, compile_seconds
+
+
+def _split(batched: Callable[..., Any], lanes: list[np.ndarray]) -> tuple[Callable[..., Any], list[Any]]:
+    """The function on all devices, each with its part of the last axis, and its arguments put there."""
+    mesh = Mesh(np.asarray(jax.devices()), ("lanes",))
+
+    def last_axis(x: Any) -> PartitionSpec:
+        return PartitionSpec(*(None,) * (x.ndim - 1), "lanes")
+
+    results = jax.tree.map(last_axis, jax.eval_shape(batched, *lanes))
+    specs = tuple(map(last_axis, lanes))
+    function = jax.shard_map(batched, mesh=mesh, in_specs=specs, out_specs=results, check_vma=False)
+    return function, [jax.device_put(x, NamedSharding(mesh, spec)) for x, spec in zip(lanes, specs, strict=True)]
 
 
 def _rotations(rng: np.random.Generator, count: int, largest: float = np.pi) -> np.ndarray:

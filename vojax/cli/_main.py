@@ -49,13 +49,19 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"vojax {__version__}")
         return 0
-    from ._arguments import Bench, Demo, Eval, Help, Run, parse
+    from ._arguments import Ba, Bench, Demo, Eval, Help, Run, parse
 
     command = parse(arguments)
     if isinstance(command, Help):
         return 0
     # The command's own module, and with it JAX, OpenCV and matplotlib, comes only now: help stays fast.
-    modules = {Demo: "_demo_command", Run: "_run_command", Eval: "_eval_command", Bench: "_bench_command"}
+    modules = {
+        Demo: "_demo_command",
+        Run: "_run_command",
+        Eval: "_eval_command",
+        Ba: "_ba_command",
+        Bench: "_bench_command",
+    }
     module = modules[type(command)]
     importlib.import_module(f"vojax.cli.{module}").execute(command)
     return 0

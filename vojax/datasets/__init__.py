@@ -1,3 +1,11 @@
+from ._bal import BalCamera as BalCamera
+from ._bal import BalProblem as BalProblem
+from ._bal import read_bal as read_bal
+from ._bal import write_bal as write_bal
+from ._colmap import ColmapBundle as ColmapBundle
+from ._colmap import ColmapModel as ColmapModel
+from ._colmap import read_colmap as read_colmap
+from ._colmap import write_colmap as write_colmap
 from ._kitti import KittiSequence as KittiSequence
 from ._motion import motion_profile as motion_profile
 from ._simulator import AbsolutePoseProblem as AbsolutePoseProblem

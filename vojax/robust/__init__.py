@@ -5,6 +5,7 @@ from ._alignment import estimate_rigid as estimate_rigid
 from ._alignment import estimate_similarity as estimate_similarity
 from ._engine import Consensus as Consensus
 from ._estimate import Estimate as Estimate
+from ._generalized_pose import estimate_generalized_pose as estimate_generalized_pose
 from ._matrix_models import estimate_fundamental as estimate_fundamental
 from ._matrix_models import estimate_homography as estimate_homography
 from ._options import RansacOptions as RansacOptions
@@ -12,3 +13,12 @@ from ._relative_pose import estimate_relative_pose as estimate_relative_pose
 from ._relative_pose import search_relative_pose as search_relative_pose
 from ._sampling import required_hypotheses as required_hypotheses
 from ._scoring import msac_scores as msac_scores
+from ._soft import Hypotheses as Hypotheses
+from ._soft import argmax_weights as argmax_weights
+from ._soft import draw_hypotheses as draw_hypotheses
+from ._soft import expected_loss as expected_loss
+from ._soft import soft_inlier_count as soft_inlier_count
+from ._soft import softmax_weights as softmax_weights
+from ._soft import sparsemax_weights as sparsemax_weights
+from ._soft_sampling import draw_gumbel_samples as draw_gumbel_samples
+from ._soft_sampling import sample_log_probability as sample_log_probability

@@ -33,6 +33,7 @@ class AbsolutePoseEstimator(eqx.Module):
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
     sample_size: int = eqx.field(static=True, default=3)
+    chunk_size: int = eqx.field(static=True, default=512)
 
     @property
     def observations(self) -> tuple[Array, ...]:

@@ -40,6 +40,7 @@ class AlignmentEstimator(eqx.Module):
     local_steps: int = eqx.field(static=True)
     with_scale: bool = eqx.field(static=True)
     sample_size: int = eqx.field(static=True, default=3)
+    chunk_size: int = eqx.field(static=True, default=512)
 
     @property
     def observations(self) -> tuple[Array, ...]:
@@ -70,11 +71,11 @@ class AlignmentEstimator(eqx.Module):
         problem = kind(self.points0, self.points1, (jnp.ones((), model.dtype),))
         loss = Tukey(2.0 * self.limit**0.5)
         weight = mask.astype(model.dtype)
-        start = _motion(model, self.with_scale)
+        start = motion_of_entries(model, self.with_scale)
         return matrix_lanes(polish_model(start, problem, weight=weight, loss=loss, steps=self.local_steps).parameters())
 
 
-def _motion(entries: Float[Array, "12"], with_scale: bool) -> SE3 | Sim3:
+def motion_of_entries(entries: Float[Array, "12"], with_scale: bool) -> SE3 | Sim3:
     """The motion of a matrix [s R | t]; the identity for zeros, which a search without any hypothesis ends with."""
     matrix = entries.reshape(3, 4)
     empty = jnp.all(entries == 0)
@@ -183,7 +184,7 @@ def _estimate(
         with_scale=with_scale,
     )
     consensus = search(estimator, mask, single_precision(quality), key, options)
-    start = jax.tree.map(lambda x: x.astype(dtype), _motion(consensus.model, with_scale))
+    start = jax.tree.map(lambda x: x.astype(dtype), motion_of_entries(consensus.model, with_scale))
 
     kind = SimilarityProblem if with_scale else RigidProblem
     chance = chance_in_box(y, mask, options.threshold)

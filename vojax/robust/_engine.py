@@ -19,12 +19,17 @@ from ._options import RansacOptions
 from ._sampling import draw_samples, guided_pool, random_uniform, required_hypotheses, sampling_order
 from ._scoring import msac_scores
 
+# Local optimisation is for chunks whose best sample explains this share of what the best sample so far explains. With
+# 1.0 (only a new best) relative poses with 70 % of outliers lose 0.04 of AUC@5°, with 0.8 nothing.
+_PROMISING = 0.8
+
 
 @runtime_checkable
 class Estimator(Protocol):
     """A kind of model, with the observations it is estimated from. A pytree; models are vectors of `d` numbers."""
 
     sample_size: int
+    chunk_size: int
     limit: float
 
     @property
@@ -58,6 +63,7 @@ class _State(eqx.Module):
     chunk: Int[Array, ""]
     model: Float[Array, " d"]
     score: Float[Array, ""]
+    sampled: Float[Array, ""]  # the lowest score of a sample
     required: Float[Array, ""]
 
 
@@ -81,7 +87,7 @@ def search(
         The polished consensus. Without any valid hypothesis the model is zero and nothing is an inlier.
     """
     n = mask.shape[0]
-    m, k = estimator.sample_size, min(options.chunk_size, options.max_hypotheses)
+    m, k = estimator.sample_size, min(options.chunk_size or estimator.chunk_size, options.max_hypotheses)
     dtype = estimator.observations[0].dtype
     count = jnp.sum(mask).astype(jnp.int32)
     weights = mask.astype(dtype)
@@ -98,7 +104,7 @@ def search(
 
     def body(state: _State) -> _State:
         drawn = state.chunk * k + jnp.arange(k)
-        pool = count if quality is None else guided_pool(drawn, count, m, options.max_hypotheses)
+        pool = count if quality is None else guided_pool(drawn, count, m)
         sample = draw_samples(random_uniform(key, state.chunk, (m, k)), order, pool)
         models, valid = estimator.hypothesize(sample)
         coarse_scores = scores_of(models, coarse_observations, weights[coarse])
@@ -106,26 +112,35 @@ def search(
         best, kept = jax.lax.top_k(-coarse_scores, min(options.survivors, models.shape[1]))
         survivors = models[:, kept]
         scores = jnp.where(jnp.isfinite(best), scores_of(survivors, estimator.observations, weights), jnp.inf)
-        # Local optimisation of the best of the chunk, so that one good sample is enough to stop.
+        # Local optimisation of the best of a chunk.
         _, top = jax.lax.top_k(-scores, min(options.top_k, scores.shape[0]))
-        found = jnp.isfinite(scores[top])
-        polished = jax.vmap(lambda model: estimator.polish(model, mask), -1, -1)(survivors[:, top])
-        polished_scores = jnp.where(found, scores_of(polished, estimator.observations, weights), jnp.inf)
-        models = jnp.concatenate([state.model[:, None], survivors[:, top], polished], axis=1)
-        scores = jnp.concatenate([state.score[None], scores[top], polished_scores])
+        sampled = jnp.minimum(state.sampled, scores[top[0]])
+
+        def optimise() -> tuple[Array, Array]:
+            polished = jax.vmap(lambda model: estimator.polish(model, mask), -1, -1)(survivors[:, top])
+            polished_scores = scores_of(polished, estimator.observations, weights)
+            return polished, jnp.where(jnp.isfinite(scores[top]), polished_scores, jnp.inf)
+
+        def leave() -> tuple[Array, Array]:
+            return survivors[:, top], scores[top]
+
+        # Raw scores of good samples vary: what comes near the best one may be better once it is optimised.
+        promising = count - scores[top[0]] > _PROMISING * (count - state.sampled)
+        polished, polished_scores = jax.lax.cond(promising, optimise, leave)
+        models = jnp.concatenate([state.model[:, None], survivors[:, top[:1]], polished], axis=1)
+        scores = jnp.concatenate([state.score[None], scores[top[:1]], polished_scores])
         best = jnp.argmin(scores)
         ratio = jnp.sum(_inliers(estimator, models[:, best], mask)) / jnp.maximum(count, 1)
         required = required_hypotheses(ratio.astype(dtype), m, options.confidence)
         required = jnp.where(jnp.isfinite(scores[best]), required, jnp.inf)
-        return _State(state.chunk + 1, models[:, best], scores[best], required)
+        return _State(state.chunk + 1, models[:, best], scores[best], sampled, required)
 
     def unfinished(state: _State) -> Array:
         return (state.chunk < num_chunks) & (state.chunk * k < state.required) & (count >= m)
 
     d = jax.eval_shape(estimator.hypothesize, jax.ShapeDtypeStruct((m, k), jnp.int32))[0].shape[0]
-    start = _State(
-        jnp.zeros((), jnp.int32), jnp.zeros((d,), dtype), jnp.asarray(jnp.inf, dtype), jnp.asarray(jnp.inf, dtype)
-    )
+    endless = jnp.asarray(jnp.inf, dtype)
+    start = _State(jnp.zeros((), jnp.int32), jnp.zeros((d,), dtype), endless, endless, endless)
     state = jax.lax.while_loop(unfinished, body, start)
     found = jnp.isfinite(state.score)
     model = jnp.where(found, state.model, 0.0)

@@ -54,6 +54,7 @@ class FundamentalEstimator(eqx.Module):
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
     sample_size: int = eqx.field(static=True, default=7)
+    chunk_size: int = eqx.field(static=True, default=256)
 
     @property
     def observations(self) -> tuple[Array, ...]:
@@ -86,6 +87,7 @@ class HomographyEstimator(eqx.Module):
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
     sample_size: int = eqx.field(static=True, default=4)
+    chunk_size: int = eqx.field(static=True, default=512)
 
     @property
     def observations(self) -> tuple[Array, ...]:

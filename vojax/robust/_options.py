@@ -12,7 +12,8 @@ class RansacOptions:
         threshold: Largest distance of an inlier in scene units, where points are compared with points.
         confidence: Probability with which at least one sample was free of outliers when drawing stops.
         max_hypotheses: Most minimal samples drawn.
-        chunk_size: Samples drawn and scored together.
+        chunk_size: Samples drawn and scored together. None takes what suits the solver: 128 for five points, 512 for
+            the cheap ones.
         coarse_points: Observations that judge every hypothesis; all observations judge the best of them.
         survivors: Hypotheses of a chunk that all observations judge.
         top_k: Best hypotheses that local optimisation polishes.
@@ -24,7 +25,7 @@ class RansacOptions:
     threshold: float = 0.05
     confidence: float = 0.9999
     max_hypotheses: int = 4096
-    chunk_size: int = 256
+    chunk_size: int | None = None
     coarse_points: int = 128
     survivors: int = 64
     top_k: int = 8
@@ -46,5 +47,6 @@ class RansacOptions:
             "local_steps",
             "final_steps",
         ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: expected at least 1")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} is {value}: expected at least 1")

@@ -42,6 +42,7 @@ class RelativePoseEstimator(eqx.Module):
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
     sample_size: int = eqx.field(static=True, default=5)
+    chunk_size: int = eqx.field(static=True, default=128)
 
     @property
     def observations(self) -> tuple[Array, ...]:

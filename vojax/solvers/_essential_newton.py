@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import Vector3, cross3, dot3
+from vojax._numerics import Vector3, cross3, dot3, lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import Components, complement, floor, quaternion_from_rotation, squared
@@ -45,7 +45,7 @@ def polish_essential(
         Zeros elsewhere.
     """
     eps = float(jnp.finfo(entries.dtype).eps)
-    size = jnp.sqrt(jnp.sum(entries * entries, axis=0))
+    size = jnp.sqrt(lane_sum(entries * entries, axis=0))
     valid = valid & jnp.isfinite(size) & (size > floor(size))
     entries = jnp.where(
         valid[None],

@@ -12,7 +12,7 @@ References: R. Hartley, A. Zisserman. Multiple View Geometry in Computer Vision,
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cross3, dot3
+from vojax._numerics import cross3, dot3, lane_sum
 from vojax._types import Array, ArrayLike, Bool, Float
 
 from ._candidates import Candidates
@@ -94,7 +94,7 @@ def projection_stationarity(essential: Float[Array, "3 3"], matrix: Float[Array,
     held = jax.lax.stop_gradient(essential)
     # tᵀE = 0: rows of cofactors are along Rᵀt, columns along t. Of the left rotations, that about t is a right one too.
     columns = cofactors(held).T
-    squares = jnp.sum(columns * columns, axis=1)
+    squares = lane_sum(columns * columns, axis=1)
     longest = jnp.max(squares)
     usable = longest > 0
     upright = jnp.eye(3, dtype=held.dtype)[2]

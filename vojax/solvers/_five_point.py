@@ -19,18 +19,20 @@ References:
     H. Stewénius, C. Engels, D. Nistér. Recent developments on direct relative orientation. ISPRS 2006.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import Vector3, cross3, normalize
+from vojax._numerics import Vector3, cross3, lane_sum, normalize
 from vojax._types import Array, ArrayLike, Bool, Float
 
 from ._candidates import Candidates
 from ._components import floor, squared
 from ._essential_newton import polish_essential
 from ._implicit import implicit
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._matrix_models import perturb_essential
 from ._null_space import eliminate, null_space_and_rank
 from ._roots import polynomial_roots
@@ -51,7 +53,7 @@ def unit_rays(
         size = jnp.max(jnp.abs(rays), axis=1)
         usable = jnp.isfinite(size) & (size > 0)
         scaled = jnp.where(usable[:, None], rays / jnp.where(usable, size, 1.0)[:, None], 1.0)
-        unit.append(scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=1))[:, None])
+        unit.append(scaled / jnp.sqrt(lane_sum(scaled * scaled, axis=1))[:, None])
         proper = proper & jnp.all(usable, axis=0)
     return unit[0], unit[1], proper
 
@@ -224,9 +226,13 @@ def _coordinates(equations: tuple[tuple[Array, Array, Array], ...], u: Array, v:
     return best[0], best[1], best[2]
 
 
+_roots = one_kernel(functools.partial(polynomial_roots, slots=SLOTS))
+_polish = one_kernel(functools.partial(polish_essential, steps=4))
+
+
 def _candidate_matrices(basis: Array, degree_ten: Array, equations: tuple) -> tuple[Array, Array]:
     """E for the real roots: [9, slots, *lanes] and whether there was a root."""
-    (u, v), valid = polynomial_roots(degree_ten, SLOTS)
+    (u, v), valid = _roots(degree_ten)
     x, y, w = _coordinates(equations, u, v)
     # The null vector is that of v³ (a, b, v c), so (x, y, z, 1) ~ (X, Y, u W, v W).
     weights = (x, y, u * w, v * w)
@@ -240,11 +246,11 @@ def _solve_lanes(rays0: Array, rays1: Array) -> tuple[Array, Array]:
     basis, independent = epipolar_basis(rays0, rays1)
     equations = _equations(eliminate(cubic_constraints(basis, (*_ELIMINATED, *_REMAINING)))[4:])
     entries, valid = _candidate_matrices(basis, _determinant(equations), equations)
-    return polish_essential(entries, valid & (proper & independent)[None], rays0, rays1, steps=4)
+    return _polish(entries, valid & (proper & independent)[None], rays0, rays1)
 
 
-# A problem takes some thousand numbers: 256 lanes of them fit into the cache, and halve the time (jax 0.10.1).
-_solve = lanes_last(_solve_lanes, chunk=256)
+# A problem takes some thousand numbers: 128 lanes of them fit into the cache, and halve the time (jax 0.10.1).
+_solve = lanes_last(_solve_lanes, chunk=128)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[Array]:

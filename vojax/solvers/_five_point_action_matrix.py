@@ -16,8 +16,11 @@ References:
     R. Rehman, I. Ipsen. La Budde's method for computing characteristic polynomials. 2011.
 """
 
+import functools
+
 import jax.numpy as jnp
 
+from vojax._numerics import lane_sum
 from vojax._types import Array, ArrayLike, Float
 
 from ._candidates import Candidates
@@ -25,7 +28,7 @@ from ._components import floor
 from ._essential_newton import polish_essential, sum_of_products
 from ._five_point import SLOTS, correspondences, cubic_constraints, epipolar_basis, epipolar_equations, unit_rays
 from ._implicit import implicit
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._matrix_models import perturb_essential
 from ._null_space import eliminate
 from ._roots import polynomial_roots
@@ -50,17 +53,17 @@ def _hessenberg(matrix: Float[Array, "n n *lanes"]) -> Float[Array, "n n *lanes"
     n = matrix.shape[0]
     for k in range(n - 2):
         x = matrix[k + 1 :, k]
-        length2 = jnp.sum(x * x, axis=0)
+        length2 = lane_sum(x * x, axis=0)
         usable = length2 > floor(length2) ** 2
         safe = jnp.sqrt(jnp.where(usable, length2, 1.0))
         alpha = jnp.where(x[0] > 0, -safe, safe)
         v = jnp.concatenate([(x[0] - alpha)[None], x[1:]])
         beta = jnp.where(usable, 1.0 / (safe * safe - alpha * x[0]), 0.0)
         rows = matrix[k + 1 :]
-        rows = rows - v[:, None] * (beta[None] * jnp.sum(v[:, None] * rows, axis=0))[None]
+        rows = rows - v[:, None] * (beta[None] * lane_sum(v[:, None] * rows, axis=0))[None]
         matrix = jnp.concatenate([matrix[: k + 1], rows])
         columns = matrix[:, k + 1 :]
-        columns = columns - (beta[None] * jnp.sum(columns * v[None], axis=1))[:, None] * v[None]
+        columns = columns - (beta[None] * lane_sum(columns * v[None], axis=1))[:, None] * v[None]
         matrix = jnp.concatenate([matrix[:, : k + 1], columns], axis=1)
     return matrix
 
@@ -115,22 +118,25 @@ def _remaining_coordinates(reduced: Array, x: Array) -> tuple[Array, Array]:
     return y, z
 
 
+_roots = one_kernel(functools.partial(polynomial_roots, slots=SLOTS))
+_polish = one_kernel(functools.partial(polish_essential, steps=6))
+
+
 def _solve_lanes(rays0: Array, rays1: Array) -> tuple[Array, Array]:
     """E [10, 3, 3, *lanes] and validity [10, *lanes] from rays [5, 3, *lanes]."""
     rays0, rays1, proper = unit_rays(rays0, rays1)
     basis, independent = epipolar_basis(rays0, rays1)
     reduced = eliminate(cubic_constraints(basis, _MONOMIALS))
     polynomial = _characteristic_polynomial(_hessenberg(_action_matrix(reduced)))
-    (u, v), valid = polynomial_roots(polynomial, SLOTS)
+    (u, v), valid = _roots(polynomial)
     x = u / jnp.maximum(v, floor(v))
     y, z = _remaining_coordinates(reduced, x)
     flat = basis.reshape(4, 9, 1, *basis.shape[3:])
     entries = x[None] * flat[0] + y[None] * flat[1] + z[None] * flat[2] + flat[3]
-    return polish_essential(entries, valid & (proper & independent)[None], rays0, rays1, steps=6)
+    return _polish(entries, valid & (proper & independent)[None], rays0, rays1)
 
 
-# A problem takes some thousand numbers: 256 lanes of them fit into the cache, and halve the time (jax 0.10.1).
-_solve = lanes_last(_solve_lanes, chunk=256)
+_solve = lanes_last(_solve_lanes, chunk=128)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[Array]:

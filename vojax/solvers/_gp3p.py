@@ -15,14 +15,14 @@ References:
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import dot3, normalize
+from vojax._numerics import dot3, lane_sum, normalize
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
 from ._components import complement, floor, rotate, squared
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._six_linear import six_linear_equations
 from ._upright_three_point import placeholders
 
@@ -44,12 +44,12 @@ def _kernel(points: Array, centers: Array, bearings: Array) -> tuple[Array, Arra
     """Poses [8, 7, *lanes] and validity [8, *lanes]."""
     f, proper = unit_bearings(bearings)
     # Relative to the rays' mean origin, so that a rig frame far away costs no digits.
-    middle = centers[0] + jnp.sum(centers - centers[:1], axis=0) / 3.0
+    middle = centers[0] + lane_sum(centers - centers[:1], axis=0) / 3.0
     usable = jnp.all(jnp.isfinite(middle), axis=0)
     c = jnp.where(usable[None, None], centers - middle[None], 0.0)
     tangents = [jnp.stack(e, axis=1) for e in complement(f)]
     normals = jnp.concatenate(tangents)
-    constants = jnp.concatenate([jnp.sum(e * c, axis=1) for e in tangents])
+    constants = jnp.concatenate([lane_sum(e * c, axis=1) for e in tangents])
     double = points.dtype == jnp.float64
     model, valid = six_linear_equations(normals, jnp.concatenate([points, points]), constants, 4 if double else 3)
     quaternion = tuple(model[:, i] for i in range(4))
@@ -61,7 +61,7 @@ def _kernel(points: Array, centers: Array, bearings: Array) -> tuple[Array, Arra
     return placeholders((*quaternion, *translation), valid & (proper & usable)[None])
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: Data) -> Candidates[SE3]:

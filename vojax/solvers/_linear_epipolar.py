@@ -11,7 +11,7 @@ eight-point algorithm. PAMI 1997.
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import dot3, normalize, safe_divide
+from vojax._numerics import dot3, lane_sum, normalize, safe_divide
 from vojax._types import Array, ArrayLike, Bool, Float
 
 from ._components import Components, Rows3, floor, sign, squared
@@ -54,16 +54,16 @@ def centred_pixels(
     """
     finite = jnp.all(jnp.isfinite(pixels), axis=(0, 1))
     pixels = jnp.where(finite, pixels, 0.0)
-    total = jnp.sum(weights, axis=0)
+    total = lane_sum(weights, axis=0)
     share = weights / jnp.where(total > 0, total, 1.0)[None]
     # Relative to one of them first: the mean of large, close numbers rounds.
     base = pixels[0]
     moved = pixels - base[None]
-    mean = jnp.sum(share[:, None] * moved, axis=0)
+    mean = lane_sum(share[:, None] * moved, axis=0)
     moved = moved - mean[None]
     norm2 = moved[:, 0] * moved[:, 0] + moved[:, 1] * moved[:, 1]
     apart = norm2 > floor(norm2) ** 3
-    spread = jnp.sum(share * jnp.where(apart, jnp.sqrt(jnp.where(apart, norm2, 1.0)), 0.0), axis=0)
+    spread = lane_sum(share * jnp.where(apart, jnp.sqrt(jnp.where(apart, norm2, 1.0)), 0.0), axis=0)
     largest = jnp.max(jnp.abs(pixels), axis=(0, 1))
     rounding = 16.0 * float(jnp.finfo(pixels.dtype).eps) * largest
     usable = finite & (spread > floor(spread)) & (largest < 1.0 / floor(spread)) & (spread > rounding)
@@ -82,9 +82,9 @@ def normalised_from_pixel(transform: Components) -> Rows3:
 
 def whitened(x: Components, weights: Float[Array, "n *lanes"]) -> tuple[Components, Rows3]:
     """Bearings times the inverse of the Cholesky factor of their second moments, and that inverse as rows."""
-    total = jnp.sum(weights, axis=0)
+    total = lane_sum(weights, axis=0)
     share = weights / jnp.where(total > 0, total, 1.0)[None]
-    m = [[jnp.sum(share * x[i] * x[j], axis=0) for j in range(i + 1)] for i in range(3)]
+    m = [[lane_sum(share * x[i] * x[j], axis=0) for j in range(i + 1)] for i in range(3)]
     # The trace is 1; bearings on a plane through the centre leave the last pivot at rounding.
     least = float(jnp.finfo(total.dtype).eps)
     l00 = jnp.sqrt(jnp.maximum(m[0][0], least))
@@ -157,7 +157,7 @@ def null_space_and_least(
     rest = rows
     for k in range(m):
         x = rest[0]
-        length = jnp.sqrt(jnp.sum(x * x, axis=0))
+        length = jnp.sqrt(lane_sum(x * x, axis=0))
         usable = length > floor(length) ** 2
         alpha = -sign(x[0]) * length
         v = jnp.concatenate([(x[0] - alpha)[None], x[1:]])
@@ -165,7 +165,7 @@ def null_space_and_least(
         reflectors.append((v, beta))
         pivots.append(jnp.where(length > 0.25 * eps, alpha, 0.25 * eps))
         if k < m - 1:
-            along = jnp.sum(rest[1:] * v[None], axis=1) * beta[None]
+            along = lane_sum(rest[1:] * v[None], axis=1) * beta[None]
             rest = rest[1:] - along[:, None] * v[None]
             below.append(rest[:, 0])
             rest = rest[:, 1:]
@@ -182,16 +182,16 @@ def null_space_and_least(
     image = image / jnp.max(jnp.abs(image), axis=0)[None]
     back = image[m - 1 :] / pivots[m - 1][None]
     for k in range(m - 2, -1, -1):
-        entry = (image[k] - jnp.sum(below[k] * back, axis=0)) / pivots[k]
+        entry = (image[k] - lane_sum(below[k] * back, axis=0)) / pivots[k]
         back = jnp.concatenate([entry[None], back])
-    least = jnp.sqrt(jnp.sum(image * image, axis=0)) / jnp.sqrt(jnp.sum(back * back, axis=0))
+    least = jnp.sqrt(lane_sum(image * image, axis=0)) / jnp.sqrt(lane_sum(back * back, axis=0))
 
     q = columns - m
     basis = jnp.eye(q, dtype=rows.dtype).reshape(q, q, *(1,) * (rows.ndim - 2))
     basis = jnp.broadcast_to(basis, (q, q, *rows.shape[2:]))
     for v, beta in reversed(reflectors):
         basis = jnp.concatenate([jnp.zeros_like(basis[:, :1]), basis], axis=1)
-        along = jnp.sum(basis * v[None], axis=1) * beta[None]
+        along = lane_sum(basis * v[None], axis=1) * beta[None]
         basis = basis - along[:, None] * v[None]
     return basis, least
 
@@ -207,7 +207,7 @@ def least_vector_and_second(
     """
     columns = rows.shape[1]
     eps = float(jnp.finfo(rows.dtype).eps)
-    total = jnp.sqrt(jnp.sum(rows * rows, axis=(0, 1)))
+    total = jnp.sqrt(lane_sum(rows * rows, axis=(0, 1)))
     proper = jnp.isfinite(total) & (total > floor(total))
     scale = jnp.where(proper, total, 1.0)
     rest = jnp.where(proper, rows / scale[None, None], 0.0)
@@ -215,13 +215,13 @@ def least_vector_and_second(
     tails: list[Array] = []
     for _ in range(columns):
         x = rest[:, 0]
-        length = jnp.sqrt(jnp.sum(x * x, axis=0))
+        length = jnp.sqrt(lane_sum(x * x, axis=0))
         usable = length > floor(length) ** 2
         length = jnp.where(usable, length, 1.0)
         alpha = -sign(x[0]) * length
         v = jnp.concatenate([(x[0] - alpha)[None], x[1:]])
         beta = jnp.where(usable, 1.0 / (length * length - alpha * x[0]), 0.0)
-        along = jnp.sum(rest[:, 1:] * v[:, None], axis=0) * beta[None]
+        along = lane_sum(rest[:, 1:] * v[:, None], axis=0) * beta[None]
         rest = rest[:, 1:] - v[:, None] * along[None]
         pivots.append(jnp.where(usable, alpha, 0.0))
         tails.append(rest[0])
@@ -239,22 +239,22 @@ def least_vector_and_second(
         y = _unit(jnp.stack(forward))
         back = jnp.zeros_like(x)
         for k in range(columns - 1, -1, -1):
-            entry = (y[k] - jnp.sum(tails[k] * back, axis=0)) / safe[k]
+            entry = (y[k] - lane_sum(tails[k] * back, axis=0)) / safe[k]
             back = jnp.concatenate([entry[None], back])
         return _unit(back)
 
     def image(x: Array) -> Array:
-        return jnp.stack([pivots[k] * x[k] + jnp.sum(tails[k] * x[k + 1 :], axis=0) for k in range(columns)])
+        return jnp.stack([pivots[k] * x[k] + lane_sum(tails[k] * x[k + 1 :], axis=0) for k in range(columns)])
 
     def across(y: Array, x: Array) -> Array:
         """The part of y that is orthogonal to x, of unit length."""
-        rest = y - jnp.sum(x * y, axis=0)[None] * x
+        rest = y - lane_sum(x * y, axis=0)[None] * x
         # A clear null vector draws both iterates onto itself, now and then to the last bit: then any other vector.
-        along = [jnp.sum(x * start, axis=0) for start in starts]
+        along = [lane_sum(x * start, axis=0) for start in starts]
         spare = jnp.where((jnp.abs(along[0]) < jnp.abs(along[1]))[None], starts[0], starts[1])
-        lost = jnp.sum(rest * rest, axis=0) < (64.0 * eps) ** 2
-        rest = _unit(jnp.where(lost[None], spare - jnp.sum(x * spare, axis=0)[None] * x, rest))
-        return _unit(rest - jnp.sum(x * rest, axis=0)[None] * x)
+        lost = lane_sum(rest * rest, axis=0) < (64.0 * eps) ** 2
+        rest = _unit(jnp.where(lost[None], spare - lane_sum(x * spare, axis=0)[None] * x, rest))
+        return _unit(rest - lane_sum(x * rest, axis=0)[None] * x)
 
     def iterate(_: object, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, y, second = state
@@ -262,15 +262,15 @@ def least_vector_and_second(
         y = across(solve(y), x)
         # One Jacobi rotation makes the images orthogonal, the shorter one first.
         rx, ry = image(x), image(y)
-        gamma = 2.0 * jnp.sum(rx * ry, axis=0)
-        delta = jnp.sum(ry * ry, axis=0) - jnp.sum(rx * rx, axis=0)
+        gamma = 2.0 * lane_sum(rx * ry, axis=0)
+        delta = lane_sum(ry * ry, axis=0) - lane_sum(rx * rx, axis=0)
         denominator = jnp.abs(delta) + jnp.sqrt(delta * delta + gamma * gamma)
         usable = denominator > floor(denominator) ** 3
         tangent = jnp.where(usable, sign(delta) * gamma / jnp.where(usable, denominator, 1.0), 0.0)
         cosine = 1.0 / jnp.sqrt(1.0 + tangent * tangent)
         sine = tangent * cosine
         x, y = cosine[None] * x - sine[None] * y, sine[None] * x + cosine[None] * y
-        rx, ry = (jnp.sqrt(jnp.sum(image(z) ** 2, axis=0)) for z in (x, y))
+        rx, ry = (jnp.sqrt(lane_sum(image(z) ** 2, axis=0)) for z in (x, y))
         swap = (ry < rx)[None]
         # Any orthonormal pair bounds the second least singular value; rounding in nearly parallel ones is now and then
         # large.
@@ -293,7 +293,7 @@ _STARTS = (
 def _unit(x: Array) -> Array:
     largest = jnp.max(jnp.abs(x), axis=0)
     x = x / jnp.where(largest > 0, largest, 1.0)[None]
-    norm2 = jnp.sum(x * x, axis=0)
+    norm2 = lane_sum(x * x, axis=0)
     return x / jnp.sqrt(jnp.where(norm2 > 0, norm2, 1.0))[None]
 
 

@@ -7,6 +7,7 @@ what `implicit` needs.
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import complement, floor
@@ -50,7 +51,7 @@ def perturb_essential(essential: Float[Array, "3 3"], tangent: Float[Array, "5"]
     held = jax.lax.stop_gradient(essential)
     # tᵀE = 0: the longest of the cross products of columns is along t.
     crosses = jnp.stack([jnp.cross(held[:, i], held[:, (i + 1) % 3]) for i in range(3)])
-    squares = jnp.sum(crosses * crosses, axis=1)
+    squares = lane_sum(crosses * crosses, axis=1)
     t = crosses[jnp.argmax(squares)]
     length = jnp.sqrt(jnp.max(squares))
     usable = length > 0

@@ -10,6 +10,7 @@ References: G. Golub, C. Van Loan. Matrix Computations, 4th edition, sections 3.
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import floor, sign
@@ -36,12 +37,12 @@ def null_space_and_rank(
     m, n = rows.shape[:2]
     reflectors: list[tuple[Array, Array]] = []
     rest = rows
-    largest = jnp.max(jnp.sum(rows * rows, axis=1), axis=0)
+    largest = jnp.max(lane_sum(rows * rows, axis=1), axis=0)
     independent = jnp.isfinite(largest)
     rounding = (16.0 * float(jnp.finfo(rows.dtype).eps)) ** 2
     for k in range(m):
         x = rest[0]
-        length2 = jnp.sum(x * x, axis=0)
+        length2 = lane_sum(x * x, axis=0)
         usable = length2 > floor(length2) ** 2
         independent = independent & usable & (length2 > rounding * largest)
         alpha = -sign(x[0]) * jnp.sqrt(jnp.where(usable, length2, 1.0))
@@ -51,14 +52,14 @@ def null_space_and_rank(
         reflectors.append((v, beta))
         if k < m - 1:
             rest = rest[1:]
-            along = jnp.sum(rest * v[None], axis=1) * beta[None]
+            along = lane_sum(rest * v[None], axis=1) * beta[None]
             rest = (rest - along[:, None] * v[None])[:, 1:]
     q = n - m
     lanes = rows.shape[2:]
     basis = jnp.broadcast_to(jnp.eye(q, dtype=rows.dtype).reshape(q, q, *(1,) * len(lanes)), (q, q, *lanes))
     for v, beta in reversed(reflectors):
         basis = jnp.concatenate([jnp.zeros_like(basis[:, :1]), basis], axis=1)
-        along = jnp.sum(basis * v[None], axis=1) * beta[None]
+        along = lane_sum(basis * v[None], axis=1) * beta[None]
         basis = basis - along[:, None] * v[None]
     return basis, independent
 
@@ -77,8 +78,8 @@ def eliminate(rows: Float[Array, "m n *lanes"]) -> Float[Array, "m q *lanes"]:
         column = jax.lax.dynamic_index_in_dim(rows, k, 1, keepdims=False)
         best = jnp.argmax(jnp.where(index >= k, jnp.abs(column), -1.0), axis=0)
         chosen = index == best[None]
-        row = jnp.sum(jnp.where(chosen[:, None], rows, 0.0), axis=0)
-        pivot = jnp.sum(jnp.where(chosen, column, 0.0), axis=0)
+        row = lane_sum(jnp.where(chosen[:, None], rows, 0.0), axis=0)
+        pivot = lane_sum(jnp.where(chosen, column, 0.0), axis=0)
         row = row / jnp.where(jnp.abs(pivot) > floor(pivot), pivot, floor(pivot))[None]
         displaced = jax.lax.dynamic_index_in_dim(rows, k, 0, keepdims=False)
         factor = jnp.where(chosen, jax.lax.dynamic_index_in_dim(column, k, 0), column)

@@ -30,14 +30,14 @@ References:
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cross3
+from vojax._numerics import cross3, lane_sum
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
 from ._components import Components, difference, floor, quaternion_from_rotation, rotate, sign, squared, vector3
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._p3p import _collinearity, _law_of_cosines, _newton_depths
 from ._roots import pack, quartic_roots
 
@@ -65,7 +65,7 @@ def _real_roots(c: Array) -> tuple[Array, Array]:
     for k in range(3, -1, -1):
         power = power * v
         value = value * u + c[k][None, None] * power
-    vanishes = jnp.abs(value) < float(jnp.finfo(c.dtype).eps) ** 0.5 * jnp.sum(jnp.abs(c), axis=0)[None, None]
+    vanishes = jnp.abs(value) < float(jnp.finfo(c.dtype).eps) ** 0.5 * lane_sum(jnp.abs(c), axis=0)[None, None]
     usable = jnp.concatenate([real[:, 0], real[:, 1] & vanishes[:, 1]])
     return pack(jnp.stack([jnp.concatenate([x[:, 0], x[:, 1]]) for x in (u, v)]), usable, 4)
 
@@ -108,7 +108,7 @@ def _kernel(points_world: Array, bearings: Array) -> tuple[Array, Array]:
     size = jnp.max(jnp.abs(bearings), axis=1)
     proper = proper & jnp.all(size > 0, axis=0)
     f = jnp.where(proper[None, None], bearings / jnp.where(size > 0, size, 1.0)[:, None], 1.0)
-    f = f / jnp.sqrt(jnp.sum(f * f, axis=1))[:, None]
+    f = f / jnp.sqrt(lane_sum(f * f, axis=1))[:, None]
 
     sides = jnp.stack([points_world[0] - points_world[1], points_world[0] - points_world[2]])
     unit = jnp.max(jnp.abs(sides), axis=(0, 1))
@@ -135,7 +135,7 @@ def _kernel(points_world: Array, bearings: Array) -> tuple[Array, Array]:
     normal = cross3(edge1, edge2)
     area = jnp.sqrt(squared(normal))
     # Collinear to rounding: of the products, or of the coordinates far from the origin.
-    reach = length + jnp.sum(jnp.abs(x[0]), axis=0) / unit
+    reach = length + lane_sum(jnp.abs(x[0]), axis=0) / unit
     proper = proper & (area > 10.0 * eps * length * reach)
     length = jnp.where(proper, length, 1.0)
     a = tuple(jnp.where(proper, c / (length * length), 1.0 / 3.0) for c in a)
@@ -182,7 +182,7 @@ def _kernel(points_world: Array, bearings: Array) -> tuple[Array, Array]:
     return jnp.stack(model, axis=1), ok
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[SE3]:

@@ -26,14 +26,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cholesky_solve, cross3, dot3, safe_divide
+from vojax._numerics import cholesky_solve, cross3, dot3, lane_sum, safe_divide
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
 from ._components import Components, floor, quaternion_from_rotation, rotate, sign, squared
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._null_space import null_space_and_rank
 from ._three_quadrics import PAIRS, SLOTS, orthonormal_rows, three_quadrics
 
@@ -63,7 +63,7 @@ def _quadrics(basis: Array) -> Array:
         p, q = basis[k], basis[m]
 
         def form(i: int, j: int, p: Array = p, q: Array = q) -> Array:
-            return jnp.sum(p[i, :3] * q[j, :3], axis=0)
+            return lane_sum(p[i, :3] * q[j, :3], axis=0)
 
         once = k == m
         for row, (i, j) in zip(rows, ((0, 1), (0, 2), (1, 2)), strict=False):
@@ -74,7 +74,7 @@ def _quadrics(basis: Array) -> Array:
 
 def _combined(basis: Array, a: Array) -> Array:
     """Projections [3, 4, slots, *lanes] with coefficients a [4, slots, *lanes]."""
-    return jnp.sum(basis[:, :, :, None] * a[:, None, None], axis=0)
+    return lane_sum(basis[:, :, :, None] * a[:, None, None], axis=0)
 
 
 def _nearest(points: Array, valid: Array, mismatch: Array) -> tuple[Array, Array]:
@@ -84,7 +84,7 @@ def _nearest(points: Array, valid: Array, mismatch: Array) -> tuple[Array, Array
     taken, found = [], []
     for _ in range(_KEPT):
         best = slots == jnp.argmin(left, axis=0)[None]
-        taken.append(jnp.sum(jnp.where(best[None], points, 0.0), axis=1))
+        taken.append(lane_sum(jnp.where(best[None], points, 0.0), axis=1))
         found.append(jnp.any(best & (left < jnp.inf), axis=0))
         left = jnp.where(best, jnp.inf, left)
     return jnp.stack(taken, axis=1), jnp.stack(found)
@@ -129,11 +129,11 @@ def _gauss_newton(state: Array, x: Array, pixels: Array) -> tuple[Array, Array]:
             columns.append([*of_y, *cross3(turned, of_y), focal * ratio])
     jacobian = jnp.stack([jnp.stack(c) for c in columns], axis=1)  # [7, 8, slots, *lanes]
     residual = jnp.stack(residuals)
-    scale = jnp.sqrt(jnp.sum(jacobian * jacobian, axis=1)) + floor(residual)
+    scale = jnp.sqrt(lane_sum(jacobian * jacobian, axis=1)) + floor(residual)
     jacobian = jacobian / scale[:, None]
-    normal = jnp.sum(jacobian[:, None] * jacobian[None], axis=2)
-    gradient = jnp.sum(jacobian * residual[None], axis=1)
-    step = -cholesky_solve(normal, gradient[:, None])[0][:, 0] / scale
+    normal = lane_sum(jacobian[:, None] * jacobian[None], axis=2)
+    gradient = lane_sum(jacobian * residual[None], axis=1)
+    step = -cholesky_solve(normal, gradient[:, None], lane_sum)[0][:, 0] / scale
     size = jnp.max(jnp.abs(step[3:]), axis=0)
     step = step / jnp.maximum(1.0, 2.0 * size)[None]
     half = [0.5 * step[3 + a] for a in range(3)]
@@ -152,7 +152,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     eps = float(jnp.finfo(dtype).eps)
     usable = jnp.all(jnp.isfinite(points), axis=(0, 1)) & jnp.all(jnp.isfinite(pixels), axis=(0, 1))
     points, pixels = (jnp.where(usable[None, None], a, 0.0) for a in (points, pixels))
-    mean = points[0] + jnp.sum(points - points[:1], axis=0) / 4.0
+    mean = points[0] + lane_sum(points - points[:1], axis=0) / 4.0
     x = points - mean[None]
     spread, radius = jnp.max(jnp.abs(x), axis=(0, 1)), jnp.max(jnp.abs(pixels), axis=(0, 1))
     reach = jnp.max(jnp.abs(points), axis=(0, 1))
@@ -205,7 +205,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
         valid = valid & (turned_x[2] + state[6] > 0)
     # Two starts may lead to one minimum.
     same = jnp.abs(focal[1] - focal[0]) < 8.0 * eps**0.5 * focal[0]
-    same = same & (1.0 - jnp.abs(jnp.sum(model[0, :4] * model[1, :4], axis=0)) < 8.0 * eps)
+    same = same & (1.0 - jnp.abs(lane_sum(model[0, :4] * model[1, :4], axis=0)) < 8.0 * eps)
     first = jnp.arange(_KEPT).reshape(_KEPT, *(1,) * same.ndim) == 0
     valid = valid & jnp.isfinite(focal) & jnp.all(jnp.isfinite(model), axis=1)
     valid = valid & (first | ~(same & valid[0])[None])
@@ -213,7 +213,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     return jnp.where(valid[:, None], model, identity), jnp.where(valid, focal, 1.0), valid
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: Data) -> Candidates[FocalCamera]:

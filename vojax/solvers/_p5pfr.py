@@ -28,14 +28,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cross3, dot3, safe_divide, symmetric_inverse
+from vojax._numerics import cross3, dot3, lane_sum, safe_divide, symmetric_inverse
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
 from ._components import floor, quaternion_from_rotation, rotate, sign, squared
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._null_space import null_space_and_rank
 from ._roots import quartic_roots
 
@@ -66,9 +66,9 @@ def _conics(basis: Array) -> tuple[Array, Array]:
         for k, m in _PAIRS:
             p, q = basis[k, :, :3], basis[m, :, :3]
             if mixed:
-                entry = jnp.sum(p[0] * q[1] + p[1] * q[0], axis=0) * (0.5 if k == m else 1.0)
+                entry = lane_sum(p[0] * q[1] + p[1] * q[0], axis=0) * (0.5 if k == m else 1.0)
             else:
-                entry = jnp.sum(p[0] * q[0] - p[1] * q[1], axis=0) * (1.0 if k == m else 2.0)
+                entry = lane_sum(p[0] * q[0] - p[1] * q[1], axis=0) * (1.0 if k == m else 2.0)
             entries.append(entry)
         size = jnp.sqrt(sum(x * x for x in entries) + floor(entries[0]) ** 2)  # type: ignore[arg-type]
         conics.append(jnp.stack([x / size for x in entries]))
@@ -103,7 +103,7 @@ def _meet(a: Array, b: Array) -> tuple[Array, Array]:
     linear = p[0][None] * v + p[1][None] * u
     constant = q[0][None] * v * v + q[1][None] * u * v + q[2][None] * u * u
     point = jnp.stack([u * linear, -constant, v * linear])
-    size = jnp.sqrt(jnp.sum(point * point, axis=0))
+    size = jnp.sqrt(lane_sum(point * point, axis=0))
     valid = valid & (size > floor(size))
     return point / jnp.where(valid, size, 1.0)[None], valid
 
@@ -141,7 +141,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     eps = float(jnp.finfo(dtype).eps)
     usable = jnp.all(jnp.isfinite(points), axis=(0, 1)) & jnp.all(jnp.isfinite(pixels), axis=(0, 1))
     points, pixels = (jnp.where(usable[None, None], a, 0.0) for a in (points, pixels))
-    mean = points[0] + jnp.sum(points - points[:1], axis=0) / 5.0
+    mean = points[0] + lane_sum(points - points[:1], axis=0) / 5.0
     x = points - mean[None]
     spread, radius = jnp.max(jnp.abs(x), axis=(0, 1)), jnp.max(jnp.abs(pixels), axis=(0, 1))
     reach = jnp.max(jnp.abs(points), axis=(0, 1))
@@ -156,7 +156,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     a, b = _conics(basis)
     point, valid = _meet(a, b)
     point = jax.lax.fori_loop(0, 4 if double else 3, lambda _, c: _newton(c, a, b), point)
-    p = jnp.sum(basis[:, :, :, None] * point[:, None, None], axis=0)  # [2, 4, slots, *lanes]
+    p = lane_sum(basis[:, :, :, None] * point[:, None, None], axis=0)  # [2, 4, slots, *lanes]
     norms = [jnp.sqrt(squared((p[i, 0], p[i, 1], p[i, 2]))) for i in range(2)]
     size = jnp.sqrt(0.5 * (norms[0] * norms[0] + norms[1] * norms[1]))
     valid = valid & (usable & independent)[None] & (size > 64.0 * eps)
@@ -187,7 +187,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     third = cross3(first, second)
     quaternion = quaternion_from_rotation((first, second, third))
 
-    square = jnp.sum(u * u, axis=1)  # [5, *lanes]
+    square = lane_sum(u * u, axis=1)  # [5, *lanes]
     centred = square > 64.0 * eps
     usable_square = jnp.where(centred, square, 1.0)
     # A pixel in the centre says nothing in (3).
@@ -197,14 +197,14 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
         [scaled * square[:, None], scaled * (square * square)[:, None], -square[:, None] * jnp.ones_like(scaled)]
     )
     heights = jnp.stack([sum(third[c] * x[n, c][None] for c in range(3)) for n in range(5)]) * square[:, None]
-    scale = jnp.sqrt(jnp.sum(columns * columns, axis=1))
+    scale = jnp.sqrt(lane_sum(columns * columns, axis=1))
     columns = columns / jnp.where(scale > 0, scale, 1.0)[:, None]
-    normal = jnp.sum(columns[:, None] * columns[None], axis=2)
-    inverse, regular = symmetric_inverse(normal)
+    normal = lane_sum(columns[:, None] * columns[None], axis=2)
+    inverse, regular = symmetric_inverse(normal, lane_sum)
     solution = [jnp.zeros_like(size)] * 3
     for _ in range(2):  # the second time for what rounding left
         left = heights - sum(columns[c] * solution[c][None] for c in range(3))
-        rhs = jnp.sum(columns * left[None], axis=1)
+        rhs = lane_sum(columns * left[None], axis=1)
         solution = [solution[c] + sum(inverse[c, d] * rhs[d] for d in range(3)) for c in range(3)]
     focal, product, depth = (solution[c] / jnp.where(scale[c] > 0, scale[c], 1.0) for c in range(3))
     valid = valid & regular & (focal > floor(focal))
@@ -221,7 +221,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     distortion = distortion / (radius * radius)[None]
     valid = valid & jnp.all(jnp.isfinite(model), axis=1) & jnp.isfinite(focal) & jnp.isfinite(distortion)
     # A point met twice counts once.
-    inner = jnp.abs(jnp.sum(point[:, :, None] * point[:, None], axis=0))
+    inner = jnp.abs(lane_sum(point[:, :, None] * point[:, None], axis=0))
     near = 1.0 - inner < (0.5 if double else 2.0) * eps
     slots = jnp.arange(SLOTS)
     before = (slots[:, None] < slots[None]).reshape(SLOTS, SLOTS, *(1,) * usable.ndim)
@@ -231,7 +231,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     return jnp.where(valid[:, None], model, identity), intrinsics, valid
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: Data) -> Candidates[RadialCamera]:

@@ -25,7 +25,7 @@ from ._candidates import Candidates
 from ._components import complement, rotate
 from ._gp3p import unit_bearings
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._six_linear import six_linear_equations
 from ._upright_three_point import placeholders
 
@@ -53,7 +53,7 @@ def _kernel(points: Array, bearings: Array, ends: Array, lines: Array) -> tuple[
     return placeholders((*quaternion, *(model[:, 4 + a] for a in range(3))), valid)
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: Data) -> Candidates[SE3]:

@@ -15,6 +15,7 @@ References: G. Collins, R. Loos. Polynomial real root isolation by differentiati
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import floor, sign
@@ -105,7 +106,7 @@ def pack(
     """Move the valid entries to the front, in order, and keep as many as there are slots; zero elsewhere."""
     place = jnp.cumsum(valid.astype(jnp.int32), axis=0) - 1
     chosen = [valid & (place == slot) for slot in range(slots)]
-    taken = [jnp.sum(jnp.where(here[None], values, 0.0), axis=1) for here in chosen]
+    taken = [lane_sum(jnp.where(here[None], values, 0.0), axis=1) for here in chosen]
     return jnp.stack(taken, axis=1), jnp.stack([jnp.any(here, axis=0) for here in chosen])
 
 

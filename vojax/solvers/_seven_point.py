@@ -19,7 +19,7 @@ from vojax._types import Array, ArrayLike, Float
 from ._candidates import Candidates
 from ._components import Rows3
 from ._implicit import implicit
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._linear_epipolar import (
     algebraic_errors,
     centred_pixels,
@@ -111,7 +111,7 @@ def _kernel(pixels0: Array, pixels1: Array) -> tuple[Array, Array]:
 
 
 # On jax 0.12 pieces halve the time (seven points) or take a third off it (eight); on 0.10.1 both stay in their bounds.
-_solve = lanes_last(_kernel, chunk=256)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[Array]:

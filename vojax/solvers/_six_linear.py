@@ -16,7 +16,7 @@ References:
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import cross3, dot3, symmetric_inverse
+from vojax._numerics import cross3, dot3, lane_sum, symmetric_inverse
 from vojax._types import Array, Bool, Float
 
 from ._components import Components, floor
@@ -56,9 +56,9 @@ def _quadrics(normals: Array, x: Array, c: Array, free: Array) -> Array:
     n, p = jnp.stack(_turned(_matrix(_AFTER), normals)), jnp.stack(_turned(_matrix(_BEFORE), x))
     products = (n[:, None] * p[None]).reshape(9, *c.shape)
     table = jnp.concatenate([products, -c[None]])  # [10, 6, *lanes]
-    m = jnp.sum(free[:, None] * table[None], axis=2)
+    m = lane_sum(free[:, None] * table[None], axis=2)
     # Kept as quotients, which are not computed again.
-    m = m / jnp.sqrt(1.0 + jnp.sum(m * m, axis=1))[:, None]
+    m = m / jnp.sqrt(1.0 + lane_sum(m * m, axis=1))[:, None]
     m00, m01, m02, m10, m11, m12, m20, m21, m22, last = (m[:, k] for k in range(10))
     entries = (
         *(last + m00 + m11 + m22, 2.0 * (m21 - m12), 2.0 * (m02 - m20), 2.0 * (m10 - m01)),
@@ -95,7 +95,7 @@ def six_linear_equations(
     points = jnp.where(proper[None, None], points, 0.0)
     constants = jnp.where(proper[None], constants, 0.0)
     normals = jnp.where(proper[None, None], normals, 0.0)
-    mean = points[0] + jnp.sum(points - points[:1], axis=0) / 6.0
+    mean = points[0] + lane_sum(points - points[:1], axis=0) / 6.0
     x = points - mean[None]
     spread = jnp.max(jnp.abs(x), axis=(0, 1))
     reach = jnp.max(jnp.abs(points), axis=(0, 1))
@@ -119,14 +119,14 @@ def six_linear_equations(
         ((i2 * k - w2 * j) / norm, (j2 * k + w2 * i) / norm, 1.0 - (i2 * i + j2 * j) / norm),
     )
     # t from N t = c - (n · R x) in the least-squares sense: (Nᵀ N)⁻¹ Nᵀ times the table n ⊗ x, which no slot changes.
-    inverse, regular = symmetric_inverse(jnp.sum(normals[:, :, None] * normals[:, None], axis=0))
-    pseudo = jnp.sum(inverse[:, :, None] * jnp.swapaxes(normals, 0, 1)[None], axis=1)  # [3, 6, *lanes]
+    inverse, regular = symmetric_inverse(lane_sum(normals[:, :, None] * normals[:, None], axis=0), lane_sum)
+    pseudo = lane_sum(inverse[:, :, None] * jnp.swapaxes(normals, 0, 1)[None], axis=1)  # [3, 6, *lanes]
     products = normals[:, :, None] * x[:, None]
-    table = jnp.sum(pseudo[:, :, None, None] * products[None], axis=1)  # [3, 3, 3, *lanes]
+    table = lane_sum(pseudo[:, :, None, None] * products[None], axis=1)  # [3, 3, 3, *lanes]
     turns = jnp.stack([jnp.stack(row) for row in rotation])  # [3, 3, slots, *lanes]
-    turned = jnp.sum(table[:, :, :, None] * turns[None], axis=(1, 2))
-    moved = jnp.sum(turns * mean[None, :, None], axis=1)
-    t = unit[None, None] * (jnp.sum(pseudo * c[None], axis=1)[:, None] - turned) - moved
+    turned = lane_sum(table[:, :, :, None] * turns[None], axis=(1, 2))
+    moved = lane_sum(turns * mean[None, :, None], axis=1)
+    t = unit[None, None] * (lane_sum(pseudo * c[None], axis=1)[:, None] - turned) - moved
     tolerance = 4096.0 if dtype == jnp.float64 else 64.0
     valid = valid & (proper & regular)[None] & (residual <= tolerance * eps)
     model = jnp.stack([w, i, j, k, *t], axis=1)

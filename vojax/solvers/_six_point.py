@@ -22,14 +22,14 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import Vector3, cholesky_solve, cross3
+from vojax._numerics import Vector3, cholesky_solve, cross3, lane_sum
 from vojax._types import Array, ArrayLike, Float
 
 from ._candidates import Candidates
 from ._components import Components, complement, rotate, squared
 from ._essential_projection import nearest_essential, projection_stationarity
 from ._implicit import implicit
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._linear_epipolar import (
     algebraic_errors,
     epipolar_rows,
@@ -89,7 +89,7 @@ def _cubic_constraints(basis: Float[Array, "3 3 3 *lanes"]) -> Float[Array, "10 
     quadratic = []
     for p, q in _PAIRS:
         # The coefficient of a monomial in E Eᵀ, [3, 3, *lanes].
-        product = jnp.sum(basis[p][:, None] * basis[q][None, :], axis=2)
+        product = lane_sum(basis[p][:, None] * basis[q][None, :], axis=2)
         if p != q:
             product = product + jnp.swapaxes(product, 0, 1)
         half_trace = 0.5 * (product[0, 0] + product[1, 1] + product[2, 2])
@@ -99,7 +99,7 @@ def _cubic_constraints(basis: Float[Array, "3 3 3 *lanes"]) -> Float[Array, "10 
     for (p, q), form in zip(_PAIRS, quadratic, strict=True):
         for r in range(3):
             a, b, c = sorted((p, q, r))
-            term = jnp.sum(form[:, :, None] * basis[r][None, :, :], axis=1)
+            term = lane_sum(form[:, :, None] * basis[r][None, :, :], axis=1)
             index = _CUBIC[(a, b, c)]
             held = columns[index]
             columns[index] = term if held is None else held + term
@@ -132,7 +132,7 @@ def _linear_solution(basis: Float[Array, "3 9 *lanes"]) -> tuple[Float[Array, "9
         cube = jnp.abs(triples[k][k])
         xyz = jnp.where((cube > largest)[None], triples[k], xyz)
         largest = jnp.maximum(largest, cube)
-    return jnp.sum(xyz[:, None] * basis, axis=0), second * jnp.sqrt(jnp.sum(constraints * constraints, axis=(0, 1)))
+    return lane_sum(xyz[:, None] * basis, axis=0), second * jnp.sqrt(lane_sum(constraints * constraints, axis=(0, 1)))
 
 
 def _gauss_newton(essential: Float[Array, "9 *lanes"], rows: Float[Array, "6 9 *lanes"]) -> Float[Array, "9 *lanes"]:
@@ -147,13 +147,13 @@ def _gauss_newton(essential: Float[Array, "9 *lanes"], rows: Float[Array, "6 9 *
     zero, one = jnp.zeros_like(essential[0]), jnp.ones_like(essential[0])
     for axis in ((one, zero, zero), (zero, one, zero), (zero, zero, one)):
         directions.append(jnp.stack([c for row in e for c in cross3(row, axis)]))
-    jacobian = jnp.stack([jnp.sum(rows * direction[None], axis=1) for direction in directions])  # [5, 6, *lanes]
-    residual = jnp.sum(rows * essential[None], axis=1)
-    normal = jnp.sum(jacobian[:, None] * jacobian[None, :], axis=2)
-    gradient = jnp.sum(jacobian * residual[None], axis=1)
-    step = cholesky_solve(normal, gradient[:, None])[0][:, 0]
+    jacobian = jnp.stack([lane_sum(rows * direction[None], axis=1) for direction in directions])  # [5, 6, *lanes]
+    residual = lane_sum(rows * essential[None], axis=1)
+    normal = lane_sum(jacobian[:, None] * jacobian[None, :], axis=2)
+    gradient = lane_sum(jacobian * residual[None], axis=1)
+    step = cholesky_solve(normal, gradient[:, None], lane_sum)[0][:, 0]
     # No more than a tenth of a radian at once.
-    length = jnp.sqrt(jnp.sum(step * step, axis=0))
+    length = jnp.sqrt(lane_sum(step * step, axis=0))
     half = step * (-0.5 / jnp.maximum(1.0, 10.0 * length))[None]
     left = _quaternion(tuple(half[0] * x + half[1] * y for x, y in zip(first, second, strict=True)))
     right = _quaternion((-half[2], -half[3], -half[4]))
@@ -202,7 +202,7 @@ def _kernel(rays0: Array, rays1: Array) -> tuple[Array, Array]:
     return jnp.where(valid, models, 0.0)[None], valid[None]
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
 def _candidates(data: tuple[Array, Array]) -> Candidates[Array]:

@@ -24,7 +24,7 @@ import operator
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import Vector3, cross3, dot3
+from vojax._numerics import Vector3, cross3, dot3, lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import floor, squared
@@ -81,8 +81,8 @@ def orthonormal_rows(rows: Float[Array, "3 n *lanes"]) -> tuple[Float[Array, "3 
         row = rows[k]
         for _ in range(2 if done else 0):  # twice is enough
             for other in done:
-                row = row - other * jnp.sum(other * row, axis=0)[None]
-        left = jnp.sum(row * row, axis=0)
+                row = row - other * lane_sum(other * row, axis=0)[None]
+        left = lane_sum(row * row, axis=0)
         # What is left of one row is uncertain by rounding over what was left of those before. Of equal points and the
         # like, the product is some 200 eps at most.
         volume = volume * left
@@ -213,7 +213,7 @@ def _null_vector(rows: tuple[Row, Row, Row], u: Array, v: Array) -> Vector3:
 
 
 def _unit4(x: Array) -> Array:
-    size = jnp.sqrt(jnp.sum(x * x, axis=0))
+    size = jnp.sqrt(lane_sum(x * x, axis=0))
     return x / jnp.where(size > floor(size), size, jnp.inf)[None]
 
 
@@ -282,9 +282,9 @@ def three_quadrics(
     points = jax.lax.fori_loop(0, newton_steps, lambda _, p: _newton(quadrics, p), points)
     values, _ = _values(quadrics, points)
     residual = jnp.maximum(jnp.maximum(jnp.abs(values[0]), jnp.abs(values[1])), jnp.abs(values[2]))
-    valid = valid & (size > floor(size))[None] & (jnp.sum(points * points, axis=0) > 0.5)
+    valid = valid & (size > floor(size))[None] & (lane_sum(points * points, axis=0) > 0.5)
     # A point met twice counts once.
-    inner = jnp.abs(jnp.sum(points[:, :, None] * points[:, None], axis=0))
+    inner = jnp.abs(lane_sum(points[:, :, None] * points[:, None], axis=0))
     near = 1.0 - inner < (0.5 if eps < 1e-10 else 2.0) * eps
     slots = jnp.arange(SLOTS)
     before = (slots[:, None] < slots[None]).reshape(SLOTS, SLOTS, *(1,) * size.ndim)

@@ -31,14 +31,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import Vector3, cross3, dot3, normalize
+from vojax._numerics import Vector3, cross3, dot3, lane_sum, normalize
 from vojax._types import Array, ArrayLike, Bool, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
 from ._components import Components, Rows3, complement, floor, quaternion_from_rotation, squared, vector3
 from ._implicit import implicit, perturb_camera
-from ._lanes import lanes_last
+from ._lanes import lanes_last, one_kernel
 from ._roots import quartic_roots
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -76,8 +76,8 @@ def upright_bearings(rays: Float[Array, "n 3 *lanes"], axes: Rows3) -> tuple[Vec
 
 def align_horizontally(f: Vector3, g: Vector3) -> tuple[Vector3, tuple[Array, Array]]:
     """Turn f about y by the angle that aligns it best with g; also the angle's cosine and sine."""
-    cosine = jnp.sum(f[0] * g[0] + f[2] * g[2], axis=0)
-    sine = jnp.sum(f[2] * g[0] - f[0] * g[2], axis=0)
+    cosine = lane_sum(f[0] * g[0] + f[2] * g[2], axis=0)
+    sine = lane_sum(f[2] * g[0] - f[0] * g[2], axis=0)
     size = jnp.sqrt(cosine * cosine + sine * sine)
     usable = size > floor(size)
     cosine = jnp.where(usable, cosine / jnp.where(usable, size, 1.0), 1.0)
@@ -259,7 +259,7 @@ def _kernel(rays0: Array, rays1: Array, up0: Array, up1: Array) -> tuple[Array, 
     return placeholders(pose_components(axes0, axes1, angle, t), valid)
 
 
-_solve = lanes_last(_kernel)
+_solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 Data = tuple[Array, Array, Array, Array]
 
