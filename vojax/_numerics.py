@@ -50,7 +50,8 @@ def lane_sum(x: Float[Array, "..."], axis: int | tuple[int, ...]) -> Float[Array
     """Sum over axes that are not lanes, which XLA may make part of a kernel.
 
     From jax 0.12 on XLA takes every float32 sum for a call into a library of its own, at the price of a kernel before
-    and one behind it. Rounding to the precision that the numbers have anyway keeps it from seeing one.
+    and one behind it. Rounding to the precision that the numbers have anyway keeps it from seeing one. It has a
+    derivative but cannot be transposed: solving for a derivative takes `jnp.sum`.
     """
     axes = (axis,) if isinstance(axis, int) else axis
     return _sum_over(tuple(a % x.ndim for a in axes))(x)

@@ -110,7 +110,6 @@ def _kernel(pixels0: Array, pixels1: Array) -> tuple[Array, Array]:
     return jnp.moveaxis(jnp.where(valid[None, None], models, 0.0), 2, 0), valid
 
 
-# On jax 0.12 pieces halve the time (seven points) or take a third off it (eight); on 0.10.1 both stay in their bounds.
 _solve = lanes_last(one_kernel(_kernel), chunk=128)
 
 
