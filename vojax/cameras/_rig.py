@@ -18,7 +18,7 @@ class Rig(eqx.Module):
         cameras: One for each view.
         cam_from_rig: Their poses, with one leading axis `[c]`.
 
-    Degenerate input: a camera index out of range is taken for that of the last camera; mask it.
+    Degenerate input: a camera index out of range gives a finite result that means nothing; mask it.
     Differentiability: that of the camera models and poses, both modes, in all of both.
 
     Raises:

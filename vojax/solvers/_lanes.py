@@ -79,8 +79,8 @@ def one_kernel(phase: Callable[..., Any]) -> Callable[..., Any]:
 
     XLA makes a kernel of every few operations. What these hand on in memory, and from thread to thread, costs more
     than the work of a solver of thousands of them: as one function `gp3p`, `p4pf`, `six_point` take half the time of
-    two threads, on one, and compile faster. Use it with `chunk` (128 lanes: of much larger
-    operations XLA refuses to make one function) and without sums and products of matrices, which are library calls (`lane_sum`).
+    two threads, on one, and compile faster. Use it with `chunk` (128 lanes: of much larger operations XLA refuses to
+    make one function) and without sums and products of matrices, which are library calls (`lane_sum`).
 
     An attribute of XLA's CPU compiler, which gives it to small loops of its own accord; other compilers are not asked,
     nor versions on which it was not tried.
