@@ -19,7 +19,7 @@ from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import masked_pairs, matrix_lanes
+from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes
 from ._significance import chance_in_image
 
 
@@ -126,15 +126,7 @@ def estimate_absolute_pose(
         >>> int(estimate.num_inliers)
         50
     """
-    points_world, pixels = jnp.asarray(points_world), jnp.asarray(pixels)
-    n = points_world.shape[0]
-    if points_world.shape != (n, 3) or pixels.shape != (n, 2):
-        raise ValueError(
-            f"points_world has shape {points_world.shape} and pixels {pixels.shape}: expected (n, 3) and (n, 2), "
-            "one row for each correspondence"
-        )
-    if n < 3:
-        raise ValueError(f"{n} correspondences: a pose needs at least 3, and 4 to be unique")
+    points_world, pixels = checked_observations(points_world, pixels)
     return _estimate(points_world, pixels, camera, key, options, sigma_px, quality, mask)
 
 
@@ -150,11 +142,7 @@ def _estimate(
     mask: Any,
 ) -> Estimate[SE3]:
     points_world, pixels, mask = masked_pairs(points_world, pixels, mask)
-    count = jnp.sum(mask)
-
-    # Poses are solved about the centre of the points, wherever the world's origin is.
-    center = jax.lax.stop_gradient(jnp.sum(points_world, axis=0) / jnp.maximum(count, 1).astype(points_world.dtype))
-    centered = jnp.where(mask[:, None], points_world - center[None], 0.0)
+    centered, center = about_middle(points_world, mask)
     start, consensus = search_absolute_pose(centered, pixels, camera, mask, quality, key, options)
 
     dtype = points_world.dtype

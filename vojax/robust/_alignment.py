@@ -27,7 +27,7 @@ from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import checked_pairs, masked_pairs, matrix_lanes, root_mean_square, single_precision
+from ._pairs import about_middle, checked_pairs, masked_pairs, matrix_lanes, root_mean_square, single_precision
 from ._significance import SQRT_TAU, chance_in_box, even_odds
 
 
@@ -173,10 +173,7 @@ def _estimate(
     points0, points1, mask = masked_pairs(points0, points1, mask)
     dtype = points0.dtype
     sigma = options.threshold / 3.0 if sigma is None else sigma
-    # About the middles of both sets, wherever the origins are.
-    count = jnp.maximum(jnp.sum(mask), 1).astype(dtype)
-    center0, center1 = (jax.lax.stop_gradient(jnp.sum(x, axis=0) / count) for x in (points0, points1))
-    x, y = (jnp.where(mask[:, None], p - c[None], 0.0) for p, c in ((points0, center0), (points1, center1)))
+    (x, center0), (y, center1) = about_middle(points0, mask), about_middle(points1, mask)
     estimator = AlignmentEstimator(
         *single_precision((x, y)),
         limit=options.threshold**2,

@@ -31,7 +31,14 @@ from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import masked_pairs, matrix_lanes, root_mean_square, single_precision
+from ._pairs import (
+    about_middle,
+    checked_observations,
+    masked_pairs,
+    matrix_lanes,
+    root_mean_square,
+    single_precision,
+)
 from ._significance import SQRT_TAU, chance_in_image, even_odds
 
 
@@ -116,17 +123,13 @@ def estimate_generalized_pose(
         ValueError: If shapes do not fit or there are fewer than three correspondences.
     References: see the module.
     """
-    points_world, pixels, camera_index = jnp.asarray(points_world), jnp.asarray(pixels), jnp.asarray(camera_index)
-    n = points_world.shape[0]
-    if points_world.shape != (n, 3) or pixels.shape != (n, 2) or camera_index.shape != (n,):
+    points_world, pixels = checked_observations(points_world, pixels)
+    camera_index = jnp.asarray(camera_index)
+    if camera_index.shape != points_world.shape[:1] or not jnp.issubdtype(camera_index.dtype, jnp.integer):
         raise ValueError(
-            f"points_world has shape {points_world.shape}, pixels {pixels.shape} and camera_index "
-            f"{camera_index.shape}: expected (n, 3), (n, 2) and (n,), one row for each correspondence"
+            f"camera_index has shape {camera_index.shape} and dtype {camera_index.dtype}: expected one integer for "
+            f"each of {len(points_world)} correspondences"
         )
-    if not jnp.issubdtype(camera_index.dtype, jnp.integer):
-        raise ValueError(f"camera_index has dtype {camera_index.dtype}: expected integers")
-    if n < 3:
-        raise ValueError(f"{n} correspondences: a pose needs at least 3, and 4 to be unique")
     return _estimate(points_world, pixels, camera_index, rig, key, options, sigma_px, quality, mask)
 
 
@@ -147,10 +150,7 @@ def _estimate(
         points_world, pixels, known if mask is None else known & jnp.asarray(mask)
     )
     dtype = points_world.dtype
-    # Poses are solved about the centre of the points, wherever the world's origin is.
-    count = jnp.sum(mask)
-    center = jax.lax.stop_gradient(jnp.sum(points_world, axis=0) / jnp.maximum(count, 1).astype(dtype))
-    centered = jnp.where(mask[:, None], points_world - center[None], 0.0)
+    centered, center = about_middle(points_world, mask)
 
     local, local_pixels, local_rig = single_precision((centered, pixels, rig))
     estimator = GeneralizedPoseEstimator(
@@ -168,7 +168,7 @@ def _estimate(
     chance = chance_in_image(pixels, mask, options.threshold_px)
     cut = even_odds(
         jnp.sum(consensus.inliers),
-        count,
+        jnp.sum(mask),
         1.0 / (SQRT_TAU * sigma) ** 2,
         chance / (jnp.pi * options.threshold_px**2),
     )

@@ -109,11 +109,39 @@ def checked_pairs(
     return first.astype(dtype), second.astype(dtype)
 
 
+def checked_observations(points_world: Any, pixels: Any) -> tuple[Float[Array, "n 3"], Float[Array, "n 2"]]:
+    """Points and pixels as arrays.
+
+    Raises:
+        ValueError: If shapes do not fit or there are fewer rows than a minimal sample has.
+    """
+    points_world, pixels = jnp.asarray(points_world), jnp.asarray(pixels)
+    n = points_world.shape[0]
+    if points_world.shape != (n, 3) or pixels.shape != (n, 2):
+        raise ValueError(
+            f"points_world has shape {points_world.shape} and pixels {pixels.shape}: expected (n, 3) and (n, 2), "
+            "one row for each correspondence"
+        )
+    if n < 3:
+        raise ValueError(f"{n} correspondences: a pose needs at least 3, and 4 to be unique")
+    return points_world, pixels
+
+
 def masked_pairs(first: Array, second: Array, mask: Any) -> tuple[Array, Array, Bool[Array, " n"]]:
     """Zeros in rows that do not count or are not finite, and which rows count."""
     finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
     mask = finite if mask is None else finite & jnp.asarray(mask)
     return jnp.where(mask[:, None], first, 0.0), jnp.where(mask[:, None], second, 0.0), mask
+
+
+def about_middle(points: Float[Array, "n d"], mask: Bool[Array, " n"]) -> tuple[Float[Array, "n d"], Float[Array, "d"]]:
+    """Points about the middle of those that count, wherever the origin is, and that middle.
+
+    Rows that do not count are zero, before and after; the middle is constant to differentiation.
+    """
+    count = jnp.maximum(jnp.sum(mask), 1).astype(points.dtype)
+    middle = jax.lax.stop_gradient(jnp.sum(points, axis=0) / count)
+    return jnp.where(mask[:, None], points - middle[None], 0.0), middle
 
 
 def single_precision(tree: Any) -> Any:
