@@ -15,6 +15,7 @@ from ._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from . import ba as ba
+    from . import calibration as calibration
     from . import cameras as cameras
     from . import geometry as geometry
     from . import lie as lie
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from .robust import estimate_rigid as estimate_rigid
     from .robust import estimate_similarity as estimate_similarity
 
-_FOLDERS = ("ba", "cameras", "geometry", "lie", "robust", "solvers")
+_FOLDERS = ("ba", "calibration", "cameras", "geometry", "lie", "robust", "solvers")
 _HOMES = {
     "Result": "_result",
     "SE3": "lie",

@@ -3,10 +3,13 @@
 import inspect
 import json
 
+import jax
 import pytest
 
+import vojax
 from vojax import solvers
 from vojax.cli import main
+from vojax.cli._bench_robust import SHARES, estimators
 from vojax.cli._bench_solvers import problems
 
 
@@ -38,11 +41,35 @@ def test_every_minimal_solver_is_in_the_table():
     assert takes_points - named <= helpers
 
 
+def test_every_robust_estimator_is_in_the_table():
+    facades = {name.removeprefix("estimate_") for name in dir(vojax) if name.startswith("estimate_")}
+    assert facades == set(estimators())
+
+
+def test_one_estimator_is_measured(tmp_path, capsys):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "robust", "--batch", "4", "--only", "rigid", "--json", str(file)]) == 0
+    assert "rigid" in capsys.readouterr().out
+    written = json.loads(file.read_text())
+    assert [(row["name"], row["outliers"]) for row in written["rows"]] == [("rigid", share) for share in SHARES]
+    for row in written["rows"]:
+        assert min(row["milliseconds"], row["batched"], row["compile_seconds"]) > 0
+        assert row["success"] == 1.0
+
+
+@pytest.mark.parametrize("name", sorted(estimators()))
+def test_problems_of_the_table_can_be_solved(name):
+    estimator = estimators()[name]
+    key = jax.random.key(1)
+    assert estimator.estimate(*estimator.problem(key, 100, 0.3), key).result == vojax.Result.success
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["solvers", "--batch", "0"], "batch is 0"),
         (["solvers", "--only", "no_such_solver"], "no_such_solver"),
+        (["robust", "--only", "no_such_estimator"], "no_such_estimator"),
         (["everything"], "expected one of 'solvers'"),
     ],
 )

@@ -69,7 +69,7 @@ def pose_matrices(poses):
     return matrices
 
 
-def check_gradients(function, problems, used=None, rtol=1e-6):
+def check_gradients(function, problems, used=None, rtol=1e-6, step=1e-6):
     """Reverse and forward derivatives of a scalar function of arrays against central differences, in float64."""
     used = tuple(range(len(problems[0]))) if used is None else used
 
@@ -90,7 +90,7 @@ def check_gradients(function, problems, used=None, rtol=1e-6):
         reverse, forward = derivatives(data, tangents)
         total, largest = 0.0, 0.0
         for index, back, tangent in zip(used, reverse, tangents, strict=True):
-            numeric = central_differences(value, data, index)
+            numeric = central_differences(value, data, index, step)
             largest = max(largest, np.abs(numeric).max())
             np.testing.assert_allclose(back, numeric, rtol=rtol, atol=max(rtol * np.abs(numeric).max(), 1e-9))
             total += np.sum(np.asarray(back) * tangent)

@@ -213,7 +213,9 @@ def test_gradients_equal_central_differences(family, x64):
         return jnp.sum(models * jnp.arange(1.0, 10.0).reshape(1, 3, 3))
 
     points0, points1, weights, covariance, _ = problems(family, 1, noise=5.0, seed=8, anisotropic=True, n=6)
-    check_gradients(total, [(points0[0] / 500, points1[0] / 500, weights[0], np.linalg.cholesky(covariance[0]) / 5)])
+    data = (points0[0] / 500, points1[0] / 500, weights[0], np.linalg.cholesky(covariance[0]) / 5)
+    # The solution is known to some 1e-12: smaller steps see its rounding, on some processors more than on others.
+    check_gradients(total, [data], step=1e-5)
 
 
 @pytest.mark.slow

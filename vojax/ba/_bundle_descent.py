@@ -5,10 +5,11 @@ from typing import Any
 import jax.numpy as jnp
 import optimistix as optx
 
+from ._bundle_factors import FactorBlock
 from ._bundle_layout import BundleLayout
 from ._bundle_pcg import solve_iteratively
-from ._bundle_residual import zero_like_unknowns
 from ._bundle_schur import BundleSystem, normal_equations, solve
+from ._bundle_state import zero_like_unknowns
 
 # Tolerance and most iterations of conjugate gradients: a step need not be exact, a derivative must.
 STEP_ACCURACY = (1e-2, 300)
@@ -31,8 +32,14 @@ class SchurDescent(optx.AbstractDescent):
         c, k = self.layout.columns.shape
         _, landmarks = zero_like_unknowns(self.layout, dtype)
         zeros = lambda *shape: jnp.zeros(shape, dtype)  # noqa: E731
+        factors = (columns.shape for columns in self.layout.factor_columns)
         return BundleSystem(
-            zeros(c, k, k), zeros(c, k), zeros(3, *landmarks.shape), landmarks, zeros(k, 3, self.layout.slots)
+            zeros(c, k, k),
+            zeros(c, k),
+            zeros(3, *landmarks.shape),
+            landmarks,
+            zeros(k, 3, self.layout.slots),
+            tuple(FactorBlock(zeros(f, q, q), zeros(f, q)) for f, q in factors),
         )
 
     def query(self, y: Any, f_info: Any, state: BundleSystem) -> BundleSystem:

@@ -10,23 +10,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vojax._types import Array, Float
+from vojax._types import Array
 
 from ._bundle_descent import DERIVATIVE_ACCURACY
+from ._bundle_factors import FactorBlock
 from ._bundle_layout import BundleLayout
 from ._bundle_pcg import solve_iteratively
-from ._bundle_residual import (
-    BundleData,
-    BundleState,
-    gradient_and_hessian,
-    intrinsics_deviation,
-    landmark_deviation,
-    landmark_root,
-    pose_deviation,
-    retract,
-    zero_like_unknowns,
-)
+from ._bundle_priors import intrinsics_deviation, landmark_deviation, landmark_root
+from ._bundle_residual import gradient_and_hessian
 from ._bundle_schur import BundleSystem, solve
+from ._bundle_state import BundleData, BundleState, retract, zero_like_unknowns
 from ._losses import Loss
 
 DataLoss = tuple[BundleData, Loss]
@@ -58,7 +51,7 @@ def _(gauge_free: bool, iterative: bool, primals: tuple, tangents: tuple) -> tup
         system = system.damped(jnp.asarray(1e-2 * float(jnp.finfo(dtype).eps) ** 0.5, dtype))
     step = solve_iteratively(system, layout, *DERIVATIVE_ACCURACY) if iterative else solve(system, layout)
     origin = zero_like_unknowns(layout, state.landmarks.dtype)
-    return state, jax.jvp(lambda unknowns, moves: retract(state, unknowns, moves, layout), origin, step)[1]
+    return state, jax.jvp(lambda unknowns, moves: retract(state, unknowns, moves, data, layout), origin, step)[1]
 
 
 def exact_system(
@@ -78,6 +71,7 @@ def exact_system(
         landmark=layout.sum_landmarks(hessian[k:, k:] * free[None, None]),
         landmark_gradient=layout.sum_landmarks(change[k:] * free[None]),
         cross=hessian[:k, k:] * free[None, None],
+        factors=tuple(_factor_block(i, state, data, tangent) for i in range(len(data.factors))),
     )
     return _add_priors(system, state, data, layout, tangent)
 
@@ -87,27 +81,6 @@ def _add_priors(
 ) -> BundleSystem:
     priors = data.priors
     along = lambda gradient: _change(gradient, data, tangent)  # noqa: E731
-    if priors.cam_from_world is not None:
-        at = jnp.zeros((layout.cameras, 6), system.camera.dtype)
-
-        def pose_gradient(xi: Float[Array, "c 6"], data: BundleData) -> Array:
-            cost = lambda xi: 0.5 * jnp.sum(pose_deviation(xi, state.cam_from_world, data.priors) ** 2)  # noqa: E731
-            return jax.grad(cost)(xi)
-
-        # Poses do not mix: a tangent of ones in one coordinate of all gives a column of all blocks.
-        columns = [
-            jax.jvp(lambda xi: pose_gradient(xi, data), (at,), (jnp.zeros_like(at).at[:, i].set(1.0),))[1]
-            for i in range(6)
-        ]
-        change = along(lambda data: pose_gradient(at, data))
-        system = eqx.tree_at(
-            lambda system: (system.camera, system.camera_gradient),
-            system,
-            (
-                system.camera.at[:, :6, :6].add(jnp.stack(columns, axis=-1)),
-                system.camera_gradient.at[:, :6].add(change),
-            ),
-        )
     if priors.landmarks is not None:
         root = landmark_root(priors, layout)
 
@@ -124,7 +97,7 @@ def _add_priors(
             ),
         )
     if priors.intrinsics is not None and priors.intrinsics_root is not None:
-        rows, own = layout.group_camera[:, None], 6 + jnp.arange(len(data.free))[None]
+        rows, own = layout.group_camera[:, None], jnp.arange(-len(data.free), 0)[None]
 
         def intrinsics_gradient(data: BundleData) -> Array:
             return data.priors.intrinsics_root * intrinsics_deviation(state.intrinsics, data)  # type: ignore[operator]
@@ -138,6 +111,18 @@ def _add_priors(
             ),
         )
     return system
+
+
+def _factor_block(i: int, state: BundleState, data: BundleData, tangent: DataLoss | None) -> FactorBlock:
+    """Exact Hessian of the factors of one kind, and the change of their gradient."""
+    at = data.factors[i].zero(state.landmarks.dtype)
+    # Factors do not mix: a tangent of ones in one coordinate of all gives a column of all blocks.
+    columns = [
+        jax.jvp(lambda xi: data.factors[i].gradient(xi, state.poses), (at,), (jnp.zeros_like(at).at[:, j].set(1.0),))[1]
+        for j in range(at.shape[1])
+    ]
+    change = _change(lambda data: data.factors[i].gradient(at, state.poses), data, tangent)
+    return FactorBlock(jnp.stack(columns, axis=-1), change)
 
 
 def _change(gradient, data: BundleData, tangent: DataLoss | None) -> Array:

@@ -13,12 +13,14 @@ row a pair 85 ms.
 """
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
 from vojax._types import Array, Float, Int
 
@@ -42,11 +44,21 @@ class BundleLayout(eqx.Module):
         block_cameras: The cameras of each block.
         columns: The unknown that each parameter of each camera is; their number where it is fixed.
         camera_group: The group of cameras with common intrinsics that each camera belongs to.
+        pose: The pose of each camera, or of the rig that it is in.
+        mount: Its pose in the rig; None without rigs.
         group_columns: The unknown that each free intrinsic of each group is.
         group_camera: One camera of each group; their number where it has none.
+        pose_columns: The unknowns of each pose.
+        factor_poses: The poses of every factor, by kinds.
+        factor_columns: Their unknowns.
         landmark_free: 0 for landmarks that stay where they are, else 1.
         buckets: Degree and number of landmarks of every block of slots.
         unknowns: Of the reduced system, shared ones last.
+        frames: Number of poses that are not those of cameras in a rig.
+        has_pairs: Whether pairs of slots were listed, for a reduced system that is formed.
+        sharding: How slots lie over devices; None: all on one.
+
+    With rigs a camera here is one camera of the rig at one pose of the rig: both poses are shared with others.
     """
 
     slot_observation: Int[Array, " s"]
@@ -59,11 +71,19 @@ class BundleLayout(eqx.Module):
     block_cameras: tuple[Int[Array, " n"], Int[Array, " n"]]
     columns: Int[Array, "c k"]
     camera_group: Int[Array, " c"]
+    pose: Int[Array, " c"]
+    mount: Int[Array, " c"] | None
     group_columns: Int[Array, "g m"]
     group_camera: Int[Array, " g"]
+    pose_columns: Int[Array, "t 6"]
+    factor_poses: tuple[Int[Array, "_ _"], ...]
+    factor_columns: tuple[Int[Array, "_ _"], ...]
     landmark_free: Int[Array, " l"]
     buckets: tuple[tuple[int, int], ...] = eqx.field(static=True)
     unknowns: int = eqx.field(static=True)
+    frames: int = eqx.field(static=True)
+    has_pairs: bool = eqx.field(static=True)
+    sharding: NamedSharding | None = eqx.field(static=True, default=None)
 
     @property
     def slots(self) -> int:
@@ -75,22 +95,42 @@ class BundleLayout(eqx.Module):
         """Number of cameras."""
         return self.columns.shape[0]
 
+    def take(self, unknowns: Float[Array, " u"], columns: Int[Array, "..."]) -> Float[Array, "..."]:
+        """Entries of a vector of unknowns; 0 where a parameter is fixed."""
+        if not self.unknowns:  # XLA takes nothing from nothing
+            return jnp.zeros(columns.shape, unknowns.dtype)
+        return unknowns.at[columns].get(mode="fill", fill_value=0)
+
     def expand(self, unknowns: Float[Array, " u"]) -> Float[Array, "c k"]:
-        """Every camera's share of a vector of unknowns; 0 where a parameter is fixed."""
-        return unknowns.at[self.columns].get(mode="fill", fill_value=0)
+        """Every camera's share of a vector of unknowns."""
+        return self.take(unknowns, self.columns)
+
+    def expand_poses(self, unknowns: Float[Array, " u"]) -> Float[Array, "t 6"]:
+        """Every pose's share of a vector of unknowns."""
+        return self.take(unknowns, self.pose_columns)
 
     def expand_groups(self, unknowns: Float[Array, " u"]) -> Float[Array, "g m"]:
         """The free intrinsics' share of a vector of unknowns."""
-        return unknowns.at[self.group_columns].get(mode="fill", fill_value=0)
+        return self.take(unknowns, self.group_columns)
 
-    def collapse(self, values: Float[Array, "c k"]) -> Float[Array, " u"]:
-        """Add up what cameras say about each unknown; the transpose of `expand`."""
-        return jnp.zeros((self.unknowns,), values.dtype).at[self.columns].add(values, mode="drop")
+    def collapse(self, values: Float[Array, "c k"], factors: Sequence[Float[Array, "_ _"]] = ()) -> Float[Array, " u"]:
+        """Add up what cameras, and factors, say about each unknown; the transpose of `expand`."""
+        total = jnp.zeros((self.unknowns,), values.dtype).at[self.columns].add(values, mode="drop")
+        for columns, part in zip(self.factor_columns, factors, strict=False):
+            total = total.at[columns].add(part, mode="drop")
+        return total
 
     def sum_cameras(self, rows: Float[Array, "s k"]) -> Float[Array, "c k"]:
         """Add up the slots of every camera."""
         chunks = jnp.sum(rows.at[self.camera_slots].get(mode="fill", fill_value=0), axis=1)
         return jax.ops.segment_sum(chunks, self.chunk_camera, self.cameras, indices_are_sorted=True)
+
+    def shard(self, values: Array) -> Array:
+        """Lay the last axis, of slots, over the devices."""
+        if self.sharding is None:
+            return values
+        spec = PartitionSpec(*[None] * (values.ndim - 1), *self.sharding.spec)
+        return jax.lax.with_sharding_constraint(values, NamedSharding(self.sharding.mesh, spec))
 
     def spread(self, values: Array) -> Array:
         """Give every slot the value of its landmark: `[..., l]` to `[..., s]`."""
@@ -99,7 +139,7 @@ class BundleLayout(eqx.Module):
             part = values[..., None, start : start + count]
             parts.append(jnp.broadcast_to(part, (*values.shape[:-1], degree, count)).reshape(*values.shape[:-1], -1))
             start += count
-        return jnp.concatenate(parts, axis=-1)
+        return self.shard(jnp.concatenate(parts, axis=-1))
 
     def sum_landmarks(self, values: Array) -> Array:
         """Add up the slots of every landmark: `[..., s]` to `[..., l]`."""
@@ -116,24 +156,38 @@ class Unknowns(NamedTuple):
 
     columns: np.ndarray
     camera_group: np.ndarray
+    pose: np.ndarray
+    mount: np.ndarray | None
+    pose_columns: np.ndarray
     group_columns: np.ndarray
     count: int
 
 
-def number_unknowns(free_pose: np.ndarray, camera_group: np.ndarray, free_intrinsics: np.ndarray) -> Unknowns:
+def number_unknowns(
+    free_pose: np.ndarray,
+    free_intrinsics: np.ndarray,
+    camera_group: np.ndarray,
+    pose: np.ndarray,
+    mount: np.ndarray | None,
+) -> Unknowns:
     """Number the parameters that are free.
 
     Args:
-        free_pose: For each camera and each of the six coordinates of its tangent.
-        camera_group: The group of each camera.
+        free_pose: For each pose and each of the six coordinates of its tangent.
         free_intrinsics: For each group and each free attribute of its camera.
+        camera_group: The group of each camera.
+        pose: The pose of each camera.
+        mount: The pose of each camera in its rig, if there are rigs.
     """
     free = np.concatenate([free_pose.ravel(), free_intrinsics.ravel()])
     count = int(free.sum())
     number = np.where(free, np.cumsum(free) - 1, count)
     poses = number[: free_pose.size].reshape(free_pose.shape)
     groups = number[free_pose.size :].reshape(free_intrinsics.shape)
-    return Unknowns(np.concatenate([poses, groups[camera_group]], axis=1), camera_group, groups, count)
+    chain = [poses[pose]] if mount is None else [poses[pose], poses[mount]]
+    return Unknowns(
+        np.concatenate([*chain, groups[camera_group]], axis=1), camera_group, pose, mount, poses, groups, count
+    )
 
 
 def bundle_layout(
@@ -142,6 +196,9 @@ def bundle_layout(
     used: np.ndarray,
     fixed_landmarks: np.ndarray,
     unknowns: Unknowns,
+    frames: int,
+    factor_poses: Sequence[np.ndarray],
+    with_pairs: bool,
 ) -> BundleLayout:
     """Arrange observations.
 
@@ -151,6 +208,9 @@ def bundle_layout(
         used: False for observations that get no slot.
         fixed_landmarks: True for landmarks that stay.
         unknowns: What the cameras' parameters are.
+        frames: Number of poses that are not those of cameras in a rig.
+        factor_poses: The poses `[f, n]` of every kind of factor.
+        with_pairs: Whether to list pairs of observations: far more than observations where landmarks are seen often.
     """
     observations = np.flatnonzero(used)
     # Within a landmark by camera: equal input in another order gives equal slots.
@@ -173,7 +233,7 @@ def bundle_layout(
     camera = np.where(padding, 0, camera_index[np.where(padding, 0, observation)]) if len(observation) else observation
     real = np.flatnonzero(~padding)
     camera_slots, chunk_camera = _chunks(real, camera[real], _CAMERA_CHUNK, len(observation))
-    one, other = _pairs(buckets, padding, camera)
+    one, other = _pairs(buckets if with_pairs else [], padding, camera)
     blocks, block = np.unique(camera[one] * len(unknowns.columns) + camera[other], return_inverse=True)
     left, chunk_block = _chunks(one, block, _PAIR_CHUNK, len(observation))
     right, _ = _chunks(other, block, _PAIR_CHUNK, len(observation))
@@ -188,11 +248,18 @@ def bundle_layout(
         block_cameras=(_as_index(blocks // len(unknowns.columns)), _as_index(blocks % len(unknowns.columns))),
         columns=_as_index(unknowns.columns),
         camera_group=_as_index(unknowns.camera_group),
+        pose=_as_index(unknowns.pose),
+        mount=None if unknowns.mount is None else _as_index(unknowns.mount),
+        pose_columns=_as_index(unknowns.pose_columns),
+        factor_poses=tuple(_as_index(i) for i in factor_poses),
+        factor_columns=tuple(_as_index(unknowns.pose_columns[i].reshape(len(i), -1)) for i in factor_poses),
         group_columns=_as_index(unknowns.group_columns),
         group_camera=_as_index(_first_of_each(unknowns.camera_group, len(unknowns.group_columns))),
         landmark_free=_as_index(~fixed_landmarks[landmark_order]),
         buckets=tuple(buckets),
         unknowns=unknowns.count,
+        frames=frames,
+        has_pairs=with_pairs,
     )
 
 

@@ -15,7 +15,7 @@ from vojax._numerics import symmetric_inverse
 from vojax._types import Array, Float
 
 from ._bundle_layout import BundleLayout
-from ._bundle_schur import BundleSystem, Eliminated, eliminate, substitute
+from ._bundle_schur import BundleSystem, Eliminated, eliminate, factor_blocks, substitute
 
 Product = Callable[[Array], Array]
 
@@ -35,7 +35,7 @@ def solve_iteratively(
     """
     eliminated = eliminate(system, layout)
     landmark = eliminated.forward(system.landmark_gradient)
-    rhs = layout.collapse(eliminated.to_cameras(landmark, layout) - system.camera_gradient)
+    rhs = layout.collapse(eliminated.to_cameras(landmark, layout)) - system.gradient(layout)
     precondition = block_preconditioner(eliminated, layout)
     unknowns = jax.lax.custom_linear_solve(
         product(eliminated, layout),
@@ -52,7 +52,11 @@ def product(eliminated: Eliminated, layout: BundleLayout) -> Product:
     def multiply(unknowns: Float[Array, " u"]) -> Float[Array, " u"]:
         cameras = layout.expand(unknowns)
         own = jnp.sum(eliminated.camera * cameras[:, None, :], axis=-1)
-        return layout.collapse(own - eliminated.to_cameras(eliminated.to_landmarks(cameras, layout), layout))
+        factors = []
+        for columns, block in zip(layout.factor_columns, eliminated.factors, strict=True):
+            step = layout.take(unknowns, columns)
+            factors.append(jnp.sum(block.hessian * step[:, None, :], axis=-1))
+        return layout.collapse(own - eliminated.to_cameras(eliminated.to_landmarks(cameras, layout), layout), factors)
 
     return multiply
 
@@ -62,6 +66,8 @@ def block_preconditioner(eliminated: Eliminated, layout: BundleLayout) -> Produc
     _, k, s = eliminated.cross.shape
     squares = jnp.sum(eliminated.cross[:, :, None] * eliminated.cross[:, None], axis=0).reshape(k * k, s)
     blocks = eliminated.camera - layout.sum_cameras(squares.T).reshape(-1, k, k)
+    if layout.mount is None:  # poses are in the order of the cameras
+        blocks = blocks.at[:, :6, :6].add(factor_blocks(eliminated.factors, layout, blocks.dtype))
     # Fixed parameters are ones of the diagonal, and a shared one is spread over the cameras that share it.
     free = layout.columns < layout.unknowns
     blocks = jnp.where(free[:, :, None] & free[:, None, :], blocks, jnp.eye(k, dtype=blocks.dtype)[None])

@@ -6,18 +6,23 @@ Lᵀ η = −(L⁻¹ g + Eᵀ ξ) (Szeliski, "Computer Vision", section 11.4.3).
 and derivatives; only the blocks differ.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vojax._numerics import cholesky_factor
 from vojax._types import Array, Bool, Float
 
 from ._bundle_cholesky import CholeskyFactor, cholesky
+from ._bundle_factors import FactorBlock
 from ._bundle_layout import BundleLayout
-from ._bundle_residual import Blocks, BundleData, PriorBlocks, landmark_root
+from ._bundle_priors import PriorBlocks, landmark_root
+from ._bundle_residual import Blocks
+from ._bundle_state import BundleData
 
 # Chunks of pairs multiplied at a time. A loop keeps what it gathers in the cache, and XLA from fusing the gather with
 # the reshape behind it, element by element: 11 instead of 50 ms on Ladybug-49.
@@ -32,13 +37,22 @@ class BundleSystem(eqx.Module):
     landmark: Float[Array, "3 3 l"]
     landmark_gradient: Float[Array, "3 l"]
     cross: Float[Array, "k 3 s"]
+    factors: tuple[FactorBlock, ...]
 
     def damped(self, damping: Float[Array, ""]) -> "BundleSystem":
         """Scale the diagonal by 1 + λ."""
-        k = self.camera.shape[-1]
-        camera = self.camera * (1.0 + damping * jnp.eye(k, dtype=damping.dtype)[None])
+        grow = lambda matrix: matrix * (1.0 + damping * jnp.eye(matrix.shape[-1], dtype=damping.dtype)[None])  # noqa: E731
         landmark = self.landmark * (1.0 + damping * jnp.eye(3, dtype=damping.dtype)[:, :, None])
-        return eqx.tree_at(lambda system: (system.camera, system.landmark), self, (camera, landmark))
+        factors = tuple(FactorBlock(grow(block.hessian), block.gradient) for block in self.factors)
+        return eqx.tree_at(
+            lambda system: (system.camera, system.landmark, system.factors),
+            self,
+            (grow(self.camera), landmark, factors),
+        )
+
+    def gradient(self, layout: BundleLayout) -> Float[Array, " u"]:
+        """Gradient by the unknowns of the reduced system."""
+        return layout.collapse(self.camera_gradient, [block.gradient for block in self.factors])
 
 
 def normal_equations(blocks: Blocks, data: BundleData, layout: BundleLayout) -> BundleSystem:
@@ -59,6 +73,7 @@ def normal_equations(blocks: Blocks, data: BundleData, layout: BundleLayout) -> 
         landmark=layout.sum_landmarks(_symmetric(lower)),
         landmark_gradient=layout.sum_landmarks(jnp.sum(by_landmark * blocks.residual[:, None], axis=0)),
         cross=jnp.sum(blocks.by_camera[:, :, None] * by_landmark[:, None], axis=0),
+        factors=tuple(_factor_block(*parts) for parts in blocks.factors),
     )
     return add_priors(system, blocks.priors, data, layout)
 
@@ -67,21 +82,24 @@ def add_priors(system: BundleSystem, blocks: PriorBlocks, data: BundleData, layo
     """Add the Gauss–Newton terms of the priors; each touches one block."""
     camera, camera_gradient = system.camera, system.camera_gradient
     landmark, landmark_gradient = system.landmark, system.landmark_gradient
-    if blocks.cameras.size:
-        jacobian = blocks.cameras_by_tangent
-        camera = camera.at[:, :6, :6].add(jnp.sum(jacobian[:, :, :, None] * jacobian[:, :, None, :], axis=1))
-        camera_gradient = camera_gradient.at[:, :6].add(jnp.sum(jacobian * blocks.cameras[:, :, None], axis=1))
     if blocks.landmarks.size:
         root = landmark_root(data.priors, layout)
         landmark = landmark + jnp.sum(root[:, :, None] * root[:, None], axis=0)
         landmark_gradient = landmark_gradient + jnp.sum(root * blocks.landmarks[:, None], axis=0)
     if blocks.intrinsics.size and data.priors.intrinsics_root is not None:
-        root, own = data.priors.intrinsics_root, 6 + jnp.arange(blocks.intrinsics.shape[1])
+        root, own = data.priors.intrinsics_root, jnp.arange(-blocks.intrinsics.shape[1], 0)
         camera = camera.at[layout.group_camera[:, None], own[None], own[None]].add(root * root, mode="drop")
         camera_gradient = camera_gradient.at[layout.group_camera[:, None], own[None]].add(
             root * blocks.intrinsics, mode="drop"
         )
-    return BundleSystem(camera, camera_gradient, landmark, landmark_gradient, system.cross)
+    return BundleSystem(camera, camera_gradient, landmark, landmark_gradient, system.cross, system.factors)
+
+
+def _factor_block(residual: Float[Array, "f r"], jacobian: Float[Array, "f r q"]) -> FactorBlock:
+    return FactorBlock(
+        jnp.sum(jacobian[:, :, :, None] * jacobian[:, :, None, :], axis=1),
+        jnp.sum(jacobian * residual[:, :, None], axis=1),
+    )
 
 
 def _symmetric(lower: list[list[Array]]) -> Array:
@@ -97,6 +115,7 @@ class Eliminated(eqx.Module):
     lower: tuple[Float[Array, " l"], ...]
     pivots: tuple[Float[Array, " l"], ...]
     cross: Float[Array, "3 k s"]
+    factors: tuple[FactorBlock, ...]
 
     def forward(self, values: Float[Array, "3 l"]) -> Float[Array, "3 l"]:
         """L⁻¹ times a vector a landmark."""
@@ -133,7 +152,7 @@ def eliminate(system: BundleSystem, layout: BundleLayout) -> Eliminated:
     lower = (columns[0][1], columns[0][2], columns[1][1])
     spread = layout.spread(jnp.stack([*lower, *pivots]))[:, None]
     cross = _forward([system.cross[:, j] for j in range(3)], tuple(spread[:3]), tuple(spread[3:]))
-    return Eliminated(system.camera, lower, tuple(pivots), jnp.stack(cross))
+    return Eliminated(system.camera, lower, tuple(pivots), jnp.stack(cross), system.factors)
 
 
 class Reduced(NamedTuple):
@@ -168,7 +187,10 @@ def reduced_matrix(eliminated: Eliminated, layout: BundleLayout) -> Float[Array,
     full = blocks.swapaxes(1, 2).reshape(c * k, c * k)
     # Fixed parameters leave, shared ones add up: rows first, then columns.
     gather = lambda matrix: jax.ops.segment_sum(matrix, layout.columns.reshape(-1), layout.unknowns + 1)[:-1]  # noqa: E731
-    return gather(gather(full).T)
+    matrix = gather(gather(full).T)
+    for columns, block in zip(layout.factor_columns, eliminated.factors, strict=True):
+        matrix = matrix.at[columns[:, :, None], columns[:, None, :]].add(block.hessian, mode="drop")
+    return matrix
 
 
 def _pair_products(rows: Float[Array, "s e"], layout: BundleLayout, k: int) -> Float[Array, "n k k"]:
@@ -205,7 +227,10 @@ def factor(eliminated: Eliminated, layout: BundleLayout) -> Reduced:
     matrix = reduced_matrix(eliminated, layout)
     dtype = matrix.dtype
     k = eliminated.camera.shape[-1]
-    diagonal = layout.collapse(eliminated.camera[:, jnp.arange(k), jnp.arange(k)])
+    diagonal = layout.collapse(
+        eliminated.camera[:, jnp.arange(k), jnp.arange(k)],
+        [jnp.diagonal(block.hessian, axis1=1, axis2=2) for block in eliminated.factors],
+    )
     informed = diagonal > 0
     # Jacobi scaling makes metres, radians and pixels comparable, which float32 needs.
     scale = jnp.where(informed, jax.lax.rsqrt(jnp.where(informed, diagonal, 1.0)), 0.0)
@@ -221,9 +246,10 @@ def solve(system: BundleSystem, layout: BundleLayout) -> tuple[Float[Array, " u"
     eliminated = eliminate(system, layout)
     reduced = factor(eliminated, layout)
     landmark = eliminated.forward(system.landmark_gradient)
-    rhs = layout.collapse(eliminated.to_cameras(landmark, layout) - system.camera_gradient)
+    gradient = system.gradient(layout)
+    rhs = layout.collapse(eliminated.to_cameras(landmark, layout)) - gradient
     informed = reduced.diagonal > 0
-    descent = -layout.collapse(system.camera_gradient) / jnp.where(informed, reduced.diagonal, 1.0)
+    descent = -gradient / jnp.where(informed, reduced.diagonal, 1.0)
     unknowns = jnp.where(reduced.regular, reduced.solve(rhs[:, None])[:, 0], jnp.where(informed, descent, 0.0))
     return unknowns, substitute(eliminated, landmark, unknowns, layout)
 
@@ -231,3 +257,43 @@ def solve(system: BundleSystem, layout: BundleLayout) -> tuple[Float[Array, " u"
 def substitute(eliminated: Eliminated, landmark: Array, unknowns: Array, layout: BundleLayout) -> Float[Array, "3 l"]:
     """Landmarks from cameras; `landmark` is L⁻¹ of the landmarks' gradient."""
     return -eliminated.backward(landmark + eliminated.to_landmarks(layout.expand(unknowns), layout))
+
+
+class Determined(NamedTuple):
+    """Which free variables have information in all directions, the others taken as known."""
+
+    poses: Bool[Array, " t"]
+    landmarks: Bool[Array, " l"]
+
+
+def determined(system: BundleSystem, layout: BundleLayout) -> Determined:
+    """Look at the blocks of the diagonal. What is fixed counts as determined."""
+    blocks = jnp.moveaxis(pose_blocks(system.camera, system.factors, layout), 0, -1)
+    _, _, placed = cholesky_factor(blocks)
+    _, _, known = cholesky_factor(system.landmark)
+    return Determined(placed, known | (layout.landmark_free == 0))
+
+
+def pose_blocks(
+    camera: Float[Array, "c k k"], factors: Sequence[FactorBlock], layout: BundleLayout
+) -> Float[Array, "t 6 6"]:
+    """Diagonal blocks of the poses; those of fixed coordinates are the identity's."""
+    poses = layout.pose_columns.shape[0]
+    total = jax.ops.segment_sum(camera[:, :6, :6], layout.pose, poses)
+    if layout.mount is not None:
+        total = total + jax.ops.segment_sum(camera[:, 6:12, 6:12], layout.mount, poses)
+    total = total + factor_blocks(factors, layout, total.dtype)
+    free = layout.pose_columns < layout.unknowns
+    both = free[:, :, None] & free[:, None, :]
+    return jnp.where(both, total, jnp.eye(6, dtype=total.dtype)[None])
+
+
+def factor_blocks(factors: Sequence[FactorBlock], layout: BundleLayout, dtype: np.dtype) -> Float[Array, "t 6 6"]:
+    """What factors add to the diagonal blocks of the poses."""
+    poses = layout.pose_columns.shape[0]
+    total = jnp.zeros((poses, 6, 6), dtype)
+    for index, block in zip(layout.factor_poses, factors, strict=True):
+        for i in range(index.shape[1]):
+            own = slice(6 * i, 6 * i + 6)
+            total = total + jax.ops.segment_sum(block.hessian[:, own, own], index[:, i], poses)
+    return total

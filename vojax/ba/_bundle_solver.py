@@ -11,16 +11,9 @@ import optimistix as optx
 from vojax._types import Array, Bool, Float, Int
 
 from ._bundle_layout import BundleLayout
-from ._bundle_residual import (
-    Blocks,
-    BundleData,
-    BundleState,
-    landmark_root,
-    linearize,
-    residual,
-    retract,
-    zero_like_unknowns,
-)
+from ._bundle_priors import landmark_root
+from ._bundle_residual import Blocks, linearize, residual
+from ._bundle_state import BundleData, BundleState, retract, zero_like_unknowns
 from ._levenberg_marquardt import LMOptions, NielsenSearch
 from ._losses import Loss
 
@@ -59,14 +52,16 @@ class BundleJacobian(NamedTuple):
         blocks, priors = self.blocks, self.blocks.priors
         change = jnp.sum(blocks.by_camera * at_slots[None], axis=1) + jnp.sum(blocks.by_landmark * moves[None], axis=1)
         by_priors = list(priors.residuals)
-        if priors.cameras.size:
-            by_priors[0] = jnp.sum(priors.cameras_by_tangent * cameras[:, None, :6], axis=-1)
         if priors.landmarks.size:
-            by_priors[1] = jnp.sum(landmark_root(self.data.priors, self.layout) * landmarks[None], axis=1)
+            by_priors[0] = jnp.sum(landmark_root(self.data.priors, self.layout) * landmarks[None], axis=1)
         root = self.data.priors.intrinsics_root
         if priors.intrinsics.size and root is not None:
-            by_priors[2] = root * self.layout.expand_groups(unknowns)
-        return *change, *by_priors
+            by_priors[1] = root * self.layout.expand_groups(unknowns)
+        by_factors = (
+            jnp.sum(jacobian * self.layout.take(unknowns, columns)[:, None], axis=-1)
+            for columns, (_, jacobian) in zip(self.layout.factor_columns, blocks.factors, strict=True)
+        )
+        return *change, *by_priors, *by_factors
 
 
 class _Evaluation(NamedTuple):
@@ -142,7 +137,7 @@ class BundleLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         found, _ = fn(state.y_eval, args)
         trial = _Evaluation(found, None)
         blocks = state.blocks
-        current = _Evaluation((*blocks.residual, *blocks.priors.residuals), BundleJacobian(blocks, data, layout))
+        current = _Evaluation(blocks.residuals, BundleJacobian(blocks, data, layout))
         origin = jax.tree.map(jnp.zeros_like, state.step)
         step_size, accept, _, search_state = self.search.step(
             state.first_step,
@@ -177,7 +172,7 @@ class BundleLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         trace = BundleTrace(
             **{name: getattr(state.trace, name).at[state.num_steps].set(value) for name, value in row.items()}
         )
-        y_eval = retract(y, step[0], step[1], layout)
+        y_eval = retract(y, step[0], step[1], data, layout)
         return (
             y,
             _State(jnp.array(False), y_eval, step, blocks, search_state, descent_state, trace, state.num_steps + 1),
@@ -208,7 +203,7 @@ class BundleLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _gradient_norm(system: Any, layout: BundleLayout) -> Float[Array, ""]:
-    cameras = jnp.abs(layout.collapse(system.camera_gradient))
+    cameras = jnp.abs(system.gradient(layout))
     return jnp.maximum(jnp.max(cameras, initial=0.0), jnp.max(jnp.abs(system.landmark_gradient), initial=0.0))
 
 

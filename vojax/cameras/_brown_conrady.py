@@ -13,14 +13,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vojax._types import Array, ArrayLike, Float
+from vojax._types import Array, ArrayLike, Bool, Float
 
-from ._components import as_parameter, bearings_on_plane, onto_plane
+from ._components import MAX_RADIUS, as_parameter, epsilon, onto_plane
+from ._inversion import first_sign_change
+from ._protocol import PlaneCamera
 
 # Over whole images of TUM, EuRoC and KITTI raw Newton reaches float64 rounding in 4, 4 and 5 steps.
 NEWTON_STEPS = 8
-# Rays beyond atan(100) = 89.4 degrees are distorted as if on that cone: r⁶ stays representable in float32.
-MAX_RADIUS = 100.0
 # Below this determinant of the distortion map its inverse counts as lost.
 MIN_DETERMINANT = 1e-3
 
@@ -51,12 +51,32 @@ def _jacobian(coefficients: Coefficients, x: Array, y: Array) -> tuple[Array, Ar
     return a, b, d
 
 
-def _clip_radius(x: Array, y: Array, radius: float) -> tuple[Array, Array]:
+def clip_radius(x: Array, y: Array, radius: float) -> tuple[Array, Array]:
     """Pull points outside a circle onto it."""
     r2 = x * x + y * y
     outside = r2 > radius * radius
     scale = jnp.where(outside, radius * jax.lax.rsqrt(jnp.where(outside, r2, 1.0)), 1.0)
     return x * scale, y * scale
+
+
+def invertible(coefficients: Coefficients, x: Array, y: Array) -> Array:
+    """Mask of the points of the plane z = 1 on the lens' first branch, elementwise.
+
+    They lie within the radius where the radial polynomial stops growing, and the map preserves orientation there.
+    """
+    k1, k2, _, _, k3 = coefficients
+
+    def slope(t: Array) -> Array:
+        r = t / (1.0 - t)
+        r2 = r * r
+        return 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3))
+
+    shape = jnp.broadcast_shapes(*(k.shape for k in coefficients))
+    t = first_sign_change(slope, MAX_RADIUS / (1.0 + MAX_RADIUS), shape, jnp.result_type(*coefficients))
+    limit = t / (1.0 - t)
+    inside = x * x + y * y < limit * limit
+    a, b, d = _jacobian(coefficients, jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0))
+    return inside & (a * d - b * b > MIN_DETERMINANT) & (a + d > 0)
 
 
 @jax.custom_jvp
@@ -77,10 +97,10 @@ def undistort(coefficients: Coefficients, x_distorted: Array, y_distorted: Array
         inverse = 1.0 / jnp.where(regular, det, 1.0)
         dx = jnp.where(regular, (d * ex - b * ey) * inverse, 0.5 * x)
         dy = jnp.where(regular, (a * ey - b * ex) * inverse, 0.5 * y)
-        dx, dy = _clip_radius(dx, dy, 0.5)
-        return _clip_radius(x - dx, y - dy, MAX_RADIUS)
+        dx, dy = clip_radius(dx, dy, 0.5)
+        return clip_radius(x - dx, y - dy, MAX_RADIUS)
 
-    start = _clip_radius(x_distorted, y_distorted, MAX_RADIUS)
+    start = clip_radius(x_distorted, y_distorted, MAX_RADIUS)
     return jax.lax.fori_loop(0, NEWTON_STEPS, step, start)
 
 
@@ -103,7 +123,7 @@ def _undistort_jvp(primals, tangents):
     return (x, y), (dx, dy)
 
 
-class BrownConrady(eqx.Module):
+class BrownConrady(PlaneCamera):
     """A pinhole camera with radial and decentring lens distortion (OpenCV's `k1, k2, p1, p2, k3`).
 
     Args:
@@ -117,9 +137,11 @@ class BrownConrady(eqx.Module):
         p2: Decentring coefficient of r² + 2x² in x.
         k3: Radial coefficient of r⁶.
 
-    Degenerate input: points with z = 0 or behind the camera project to finite pixels (mask by z > 0). A polynomial lens
-    folds back beyond some radius, so rays far outside the calibrated image may project into it. A pixel that no ray of
-    the invertible range reaches gets a finite bearing near the edge of that range, with gradient 0.
+    Degenerate input: points with z = 0 or behind the camera project to finite pixels. A polynomial lens folds back
+    beyond some radius, so rays far outside the calibrated image may project into it. `in_domain` masks both. A pixel
+    that no ray of the invertible range reaches gets a finite bearing near the edge of that range, with gradient 0.
+    With the lenses of TUM, KITTI and EuRoC `unproject` finds rays again up to 47, 50 and 67 degrees from the axis (the
+    images end at 37, 47 and 54). In float32 the pixel of a pixel's bearing is off by less than 1e-3 px there.
 
     Differentiability: both modes, with respect to points, pixels and parameters, and of any order; `unproject` by the
     implicit function theorem.
@@ -143,24 +165,18 @@ class BrownConrady(eqx.Module):
     def project_xyz(
         self, x: Float[ArrayLike, "*shape"], y: Float[ArrayLike, "*shape"], z: Float[ArrayLike, "*shape"]
     ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-        """Project points given by components, elementwise.
-
-        Args:
-            x: Camera-frame coordinate to the right, an array of any shape.
-            y: Camera-frame coordinate downwards.
-            z: Camera-frame depth.
-
-        Returns:
-            Pixel coordinates u and v.
-        """
+        """Project points given by components, elementwise."""
         xn, yn = onto_plane(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z))
-        xd, yd = distort(self._coefficients(), *_clip_radius(xn, yn, MAX_RADIUS))
+        xd, yd = distort(self._coefficients(), *clip_radius(xn, yn, MAX_RADIUS))
         return self.fx * xd + self.cx, self.fy * yd + self.cy
 
-    def project(self, points_cam: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 2"]:
-        """Project points of the camera frame to pixels."""
-        points = jnp.asarray(points_cam)
-        return jnp.stack(self.project_xyz(points[..., 0], points[..., 1], points[..., 2]), axis=-1)
+    def in_domain_xyz(
+        self, x: Float[ArrayLike, "*shape"], y: Float[ArrayLike, "*shape"], z: Float[ArrayLike, "*shape"]
+    ) -> Bool[Array, "*shape"]:
+        """Mask of the points in front of the camera and within the lens' invertible range, elementwise."""
+        z = jnp.asarray(z)
+        xn, yn = onto_plane(jnp.asarray(x), jnp.asarray(y), z)
+        return (z > epsilon(z)) & invertible(self._coefficients(), xn, yn)
 
     def normalized_xy(
         self, u: Float[ArrayLike, "*shape"], v: Float[ArrayLike, "*shape"]
@@ -169,12 +185,3 @@ class BrownConrady(eqx.Module):
         return undistort(
             self._coefficients(), (jnp.asarray(u) - self.cx) / self.fx, (jnp.asarray(v) - self.cy) / self.fy
         )
-
-    def normalized(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
-        """Undistorted coordinates of pixels on the plane z = 1."""
-        pixels = jnp.asarray(pixels)
-        return jnp.stack(self.normalized_xy(pixels[..., 0], pixels[..., 1]), axis=-1)
-
-    def unproject(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 3"]:
-        """Unit bearings, in the camera frame, of pixels."""
-        return bearings_on_plane(self.normalized(pixels))

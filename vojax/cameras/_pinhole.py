@@ -3,12 +3,13 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from vojax._types import Array, ArrayLike, Float
+from vojax._types import Array, ArrayLike, Bool, Float
 
-from ._components import as_parameter, bearings_on_plane, onto_plane
+from ._components import as_parameter, epsilon, onto_plane
+from ._protocol import PlaneCamera
 
 
-class Pinhole(eqx.Module):
+class Pinhole(PlaneCamera):
     """A pinhole camera without distortion.
 
     Args:
@@ -19,7 +20,7 @@ class Pinhole(eqx.Module):
         skew: Shear of the u axis, in pixels per unit of Y/Z; 0 for every ordinary sensor.
 
     Degenerate input: a point on the plane z = 0 (to rounding) projects to a far, finite pixel; a point behind the
-    camera projects through the centre. Both are the caller's to mask by z > 0.
+    camera projects through the centre. Both are the caller's to mask, by z > 0 or by `in_domain`.
 
     Differentiability: both modes, with respect to points, pixels and parameters; finite everywhere.
 
@@ -41,23 +42,16 @@ class Pinhole(eqx.Module):
     def project_xyz(
         self, x: Float[ArrayLike, "*shape"], y: Float[ArrayLike, "*shape"], z: Float[ArrayLike, "*shape"]
     ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-        """Project points given by components, elementwise.
-
-        Args:
-            x: Camera-frame coordinate to the right, an array of any shape.
-            y: Camera-frame coordinate downwards.
-            z: Camera-frame depth.
-
-        Returns:
-            Pixel coordinates u and v.
-        """
+        """Project points given by components, elementwise."""
         xn, yn = onto_plane(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z))
         return self.fx * xn + self.skew * yn + self.cx, self.fy * yn + self.cy
 
-    def project(self, points_cam: Float[ArrayLike, "*batch 3"]) -> Float[Array, "*batch 2"]:
-        """Project points of the camera frame to pixels."""
-        points = jnp.asarray(points_cam)
-        return jnp.stack(self.project_xyz(points[..., 0], points[..., 1], points[..., 2]), axis=-1)
+    def in_domain_xyz(
+        self, x: Float[ArrayLike, "*shape"], y: Float[ArrayLike, "*shape"], z: Float[ArrayLike, "*shape"]
+    ) -> Bool[Array, "*shape"]:
+        """Mask of the points in front of the camera, elementwise."""
+        z = jnp.asarray(z)
+        return z > epsilon(z)
 
     def normalized_xy(
         self, u: Float[ArrayLike, "*shape"], v: Float[ArrayLike, "*shape"]
@@ -65,15 +59,6 @@ class Pinhole(eqx.Module):
         """Coordinates on the plane z = 1 of pixels given by components, elementwise."""
         y = (jnp.asarray(v) - self.cy) / self.fy
         return (jnp.asarray(u) - self.cx - self.skew * y) / self.fx, y
-
-    def normalized(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 2"]:
-        """Coordinates of pixels on the plane z = 1."""
-        pixels = jnp.asarray(pixels)
-        return jnp.stack(self.normalized_xy(pixels[..., 0], pixels[..., 1]), axis=-1)
-
-    def unproject(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 3"]:
-        """Unit bearings, in the camera frame, of pixels."""
-        return bearings_on_plane(self.normalized(pixels))
 
     def matrix(self) -> Float[Array, "3 3"]:
         """The upper triangular calibration matrix K."""

@@ -87,13 +87,34 @@ class Ba:
 
 
 @dataclasses.dataclass(frozen=True)
+class Calibrate:
+    """Calibrate a camera, or the cameras of a rig, from images of a chessboard."""
+
+    images: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGES")]
+    """A folder, a pattern or files; for a rig one folder or pattern for each camera, views in the same order."""
+    board: Annotated[str, tyro.conf.arg(metavar="COLSxROWS")]
+    """Inner corners of the board, one fewer than squares in each direction."""
+    square: Annotated[float, tyro.conf.arg(metavar="METRES")]
+    """Side of a square."""
+    out: pathlib.Path
+    """Folder for the results; made where it does not exist."""
+    model: Literal[
+        "pinhole", "brown-conrady", "kannala-brandt", "unified", "extended-unified", "double-sphere", "scaramuzza",
+        "spherical",
+    ] = "brown-conrady"  # fmt: skip
+    """Camera model."""
+    dtype: Literal["float64", "float32"] = "float64"
+    """Precision."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Bench:
     """Measure the speed of vojax on this machine: run it while nothing else computes."""
 
-    what: Annotated[Literal["solvers"], tyro.conf.Positional]
+    what: Annotated[Literal["solvers", "robust"], tyro.conf.Positional]
     """What is measured."""
-    batch: Annotated[int, tyro.conf.arg(metavar="N")] = 100_000
-    """Problems solved in one call."""
+    batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Problems solved in one call; 100,000 for solvers and 64 for robust estimators where left out."""
     only: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Only those with this in their names."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -105,12 +126,13 @@ class Help:
     """The user asked for help and has read it."""
 
 
-Command = Demo | Run | Eval | Ba | Bench
-_COMMANDS = ("demo", "run", "eval", "ba", "bench")
+Command = Demo | Run | Eval | Ba | Calibrate | Bench
+_COMMANDS = ("demo", "run", "eval", "ba", "calibrate", "bench")
 _Choice = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Ba, tyro.conf.subcommand("ba")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )

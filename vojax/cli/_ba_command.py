@@ -7,9 +7,6 @@ from typing import Any
 
 from ._arguments import Ba
 
-# More unknowns of cameras than these are solved for iteratively.
-_MOST_DENSE = 3000
-
 
 def execute(command: Ba) -> None:
     """Read, adjust, write and print."""
@@ -120,8 +117,7 @@ def _adjust(problem: Any, command: Ba, console: Any) -> tuple[Any, dict[str, Any
     loss = {"squared": Squared(), "huber": Huber(), "cauchy": Cauchy()}[command.loss]
     options = LMOptions(max_steps=command.max_steps)
     with _table(console) as row:
-        solver = "dense" if problem.layout.unknowns <= _MOST_DENSE else "iterative"
-        arguments = {"loss": loss, "options": options, "solver": solver, "report": row}
+        arguments = {"loss": loss, "options": options, "report": row}
         start = time.perf_counter()
         compiled = eqx.filter_jit(adjust_bundle).lower(problem, **arguments).compile()
         compile_seconds = time.perf_counter() - start
@@ -141,7 +137,7 @@ def _adjust(problem: Any, command: Ba, console: Any) -> tuple[Any, dict[str, Any
         "result": Result[found.result],
         "dtype": command.dtype,
         "loss": command.loss,
-        "solver": solver,
+        "solver": "dense" if problem.layout.has_pairs else "iterative",
         "cameras": len(found.cam_from_world.wxyz_xyz),
         "points": len(found.landmarks),
         "observations": int((problem.weights > 0).sum()),

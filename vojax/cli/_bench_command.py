@@ -12,23 +12,13 @@ from rich.table import Table
 
 from vojax._version import __version__
 
+from . import _bench_robust, _bench_solvers
 from ._arguments import Bench
-from ._bench_solvers import Row, measure, problems
 from ._report import print_line, write_json
 
-
-def execute(command: Bench) -> None:
-    """Measure, print a table and, where asked, write the numbers."""
-    if command.batch < 1:
-        raise ValueError(f"the batch is {command.batch}; expected at least 1")
-    _use_every_core()
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=140)  # a file has room for whole names
-    rows = _solver_rows(command, console)
-    print_line(console, f"{command.what}, batch {command.batch}, {_machine()}")
-    table = Table()
-    for name in (
+_BATCH = {"solvers": 100_000, "robust": 64}
+_COLUMNS = {
+    "solvers": (
         "solver",
         "dtype",
         "ns per solve",
@@ -36,32 +26,69 @@ def execute(command: Bench) -> None:
         "fastest",
         "compile s",
         "PoseLib C++, published",
-    ):
-        table.add_column(name, justify="left" if name in ("solver", "dtype") else "right", no_wrap=True)
+    ),
+    "robust": ("estimator", "outliers", "ms, one problem", "ms each, in a batch", "success", "compile s"),
+}
+
+
+def execute(command: Bench) -> None:
+    """Measure, print a table and, where asked, write the numbers."""
+    batch = _BATCH[command.what] if command.batch is None else command.batch
+    if batch < 1:
+        raise ValueError(f"the batch is {batch}; expected at least 1")
+    _use_every_core()
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)  # a file has room for whole names
+    rows = (_solver_rows if command.what == "solvers" else _robust_rows)(command.only, batch, console)
+    print_line(console, f"{command.what}, batch {batch}, {_machine()}")
+    table = Table()
+    for name in _COLUMNS[command.what]:
+        text = name in ("solver", "dtype", "estimator", "outliers")
+        table.add_column(name, justify="left" if text else "right", no_wrap=True)
     for row in rows:
-        peer = "" if row.poselib_ns is None else f"{row.poselib_ns:.0f}"
-        sharded = "" if row.sharded is None else f"{row.sharded:.0f}"
-        numbers = (f"{row.nanoseconds:.0f}", sharded, f"{row.best:.0f}", f"{row.compile_seconds:.1f}", peer)
-        table.add_row(row.name, row.dtype, *numbers)
+        table.add_row(*_cells(row))
     console.print(table)
     if command.json is not None:
-        write_json(command.json, _numbers(command, rows))
+        write_json(command.json, _numbers(command.what, batch, rows))
         print_line(console, f"in {command.json}")
 
 
-def _solver_rows(command: Bench, console: Console) -> list[Row]:
+def _cells(row: _bench_solvers.Row | _bench_robust.Row) -> tuple[str, ...]:
+    if isinstance(row, _bench_robust.Row):
+        times = (f"{row.milliseconds:.2f}", f"{row.batched:.2f}")
+        return row.name, f"{row.outliers:.0%}", *times, f"{row.success:.0%}", f"{row.compile_seconds:.1f}"
+    peer = "" if row.poselib_ns is None else f"{row.poselib_ns:.0f}"
+    sharded = "" if row.sharded is None else f"{row.sharded:.0f}"
+    return row.name, row.dtype, f"{row.nanoseconds:.0f}", sharded, f"{row.best:.0f}", f"{row.compile_seconds:.1f}", peer
+
+
+def _solver_rows(only: str | None, batch: int, console: Console) -> list[_bench_solvers.Row]:
     chosen = [
         (name, problem, dtype)
-        for name, problem in problems(command.batch).items()
+        for name, problem in _bench_solvers.problems(batch).items()
         for dtype in ("float32", "float64")
-        if command.only is None or command.only in name
+        if only is None or only in name
     ]
     if not chosen:
-        raise ValueError(f"no solver is called {command.only!r}; leave --only out to see them all")
-    return [
-        measure(*item)
-        for item in track(chosen, "compiling and timing", console=console, disable=not console.is_terminal)
+        raise ValueError(f"no solver is called {only!r}; leave --only out to see them all")
+    return [_bench_solvers.measure(*item) for item in _tracked(chosen, console)]
+
+
+def _robust_rows(only: str | None, batch: int, console: Console) -> list[_bench_robust.Row]:
+    chosen = [
+        (name, estimator, share)
+        for name, estimator in _bench_robust.estimators().items()
+        for share in _bench_robust.SHARES
+        if only is None or only in name
     ]
+    if not chosen:
+        raise ValueError(f"no estimator is called {only!r}; leave --only out to see them all")
+    return [_bench_robust.measure(*item, batch) for item in _tracked(chosen, console)]
+
+
+def _tracked(items: list[Any], console: Console) -> Any:
+    return track(items, "compiling and timing", console=console, disable=not console.is_terminal)
 
 
 def _use_every_core() -> None:
@@ -77,11 +104,11 @@ def _machine() -> str:
     return f"jax {jax.__version__}, {devices}, {platform.machine()}, Python {platform.python_version()}"
 
 
-def _numbers(command: Bench, rows: list[Row]) -> dict[str, Any]:
+def _numbers(what: str, batch: int, rows: list[Any]) -> dict[str, Any]:
     versions = {"vojax": __version__, "jax": jax.__version__, "python": platform.python_version()}
     return {
-        "what": command.what,
-        "batch": command.batch,
+        "what": what,
+        "batch": batch,
         "device": jax.default_backend(),
         "versions": versions,
         "rows": [row._asdict() for row in rows],

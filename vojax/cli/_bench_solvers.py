@@ -135,6 +135,7 @@ def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
         "gpnp, 10 points": (solvers.gpnp, lambda: rig(10), None),
         "generalized_relative_pose, 17 points": (solvers.generalized_relative_pose, lambda: rig_motion(17), None),
         "p4pf": (solvers.p4pf, lambda: unknown_focal(4), 2485.0),
+        "p4pfr": (solvers.p4pfr, lambda: unknown_focal(4), None),
         "p5pfr": (solvers.p5pfr, lambda: unknown_focal(5), 1460.0),
         "p3l": (solvers.p3l, lambda: lines(3), None),
         "p2p1l": (solvers.p2p1l, lambda: (*pose(2), *lines(1)), None),

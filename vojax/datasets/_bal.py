@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, Int
 
-from vojax._types import Array, ArrayLike, Float
+from vojax._types import Array, ArrayLike, Bool, Float
 from vojax.cameras._components import as_parameter, bearings_on_plane, onto_plane
 from vojax.lie import SE3, SO3
 
@@ -76,6 +76,10 @@ class BalCamera(eqx.Module):
     def unproject(self, pixels: Float[ArrayLike, "*batch 2"]) -> Float[Array, "*batch 3"]:
         """Unit bearings, in the camera frame, of pixels."""
         return bearings_on_plane(self.normalized(pixels))
+
+    def in_domain(self, points_cam: Float[ArrayLike, "*batch 3"]) -> Bool[Array, "*batch"]:
+        """Mask of the points in front of the camera."""
+        return jnp.asarray(points_cam)[..., 2] > 0
 
 
 class BalProblem(eqx.Module):

@@ -1,3 +1,5 @@
+from ._chessboard import chessboard_points as chessboard_points
+from ._chessboard import find_chessboard as find_chessboard
 from ._detect import DetectorOptions as DetectorOptions
 from ._detect import Keypoints as Keypoints
 from ._detect import detect as detect

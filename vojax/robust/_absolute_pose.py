@@ -19,7 +19,7 @@ from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes
+from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes, usable_noise
 from ._significance import chance_in_image
 
 
@@ -142,6 +142,7 @@ def _estimate(
     mask: Any,
 ) -> Estimate[SE3]:
     points_world, pixels, mask = masked_pairs(points_world, pixels, mask)
+    sigma_px, mask = usable_noise(sigma_px, mask)
     centered, center = about_middle(points_world, mask)
     start, consensus = search_absolute_pose(centered, pixels, camera, mask, quality, key, options)
 

@@ -27,7 +27,15 @@ from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import about_middle, checked_pairs, masked_pairs, matrix_lanes, root_mean_square, single_precision
+from ._pairs import (
+    about_middle,
+    checked_pairs,
+    masked_pairs,
+    matrix_lanes,
+    root_mean_square,
+    single_precision,
+    usable_noise,
+)
 from ._significance import SQRT_TAU, chance_in_box, even_odds
 
 
@@ -172,7 +180,7 @@ def _estimate(
 ) -> Estimate[Any]:
     points0, points1, mask = masked_pairs(points0, points1, mask)
     dtype = points0.dtype
-    sigma = options.threshold / 3.0 if sigma is None else sigma
+    sigma, mask = usable_noise(options.threshold / 3.0 if sigma is None else sigma, mask)
     (x, center0), (y, center1) = about_middle(points0, mask), about_middle(points1, mask)
     estimator = AlignmentEstimator(
         *single_precision((x, y)),

@@ -38,6 +38,7 @@ from ._pairs import (
     matrix_lanes,
     root_mean_square,
     single_precision,
+    usable_noise,
 )
 from ._significance import SQRT_TAU, chance_in_image, even_odds
 
@@ -123,6 +124,18 @@ def estimate_generalized_pose(
         ValueError: If shapes do not fit or there are fewer than three correspondences.
     References: see the module.
     """
+    points_world, pixels, camera_index = checked_rig_observations(points_world, pixels, camera_index)
+    return _estimate(points_world, pixels, camera_index, rig, key, options, sigma_px, quality, mask)
+
+
+def checked_rig_observations(
+    points_world: Any, pixels: Any, camera_index: Any
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 2"], Int[Array, " n"]]:
+    """Points, pixels and the cameras that saw them as arrays.
+
+    Raises:
+        ValueError: If shapes do not fit or there are fewer rows than a minimal sample has.
+    """
     points_world, pixels = checked_observations(points_world, pixels)
     camera_index = jnp.asarray(camera_index)
     if camera_index.shape != points_world.shape[:1] or not jnp.issubdtype(camera_index.dtype, jnp.integer):
@@ -130,7 +143,7 @@ def estimate_generalized_pose(
             f"camera_index has shape {camera_index.shape} and dtype {camera_index.dtype}: expected one integer for "
             f"each of {len(points_world)} correspondences"
         )
-    return _estimate(points_world, pixels, camera_index, rig, key, options, sigma_px, quality, mask)
+    return points_world, pixels, camera_index
 
 
 @eqx.filter_jit
@@ -149,6 +162,7 @@ def _estimate(
     points_world, pixels, mask = masked_pairs(
         points_world, pixels, known if mask is None else known & jnp.asarray(mask)
     )
+    sigma_px, mask = usable_noise(sigma_px, mask)
     dtype = points_world.dtype
     centered, center = about_middle(points_world, mask)
 

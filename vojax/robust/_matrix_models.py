@@ -42,6 +42,7 @@ from ._pairs import (
     pair_rays,
     root_mean_square,
     single_precision,
+    usable_noise,
 )
 from ._significance import SQRT_TAU, chance_in_image, chance_near_line, even_odds
 
@@ -204,6 +205,7 @@ def _fundamental(
     pixels0: Array, pixels1: Array, key: Any, options: RansacOptions, sigma_px: Any, quality: Any, mask: Any
 ) -> Estimate[Array]:
     pixels0, pixels1, mask = masked_pairs(pixels0, pixels1, mask)
+    sigma_px, mask = usable_noise(sigma_px, mask)
     chance = chance_near_line(pixels1, mask, options.threshold_px)
     densities = (1.0 / SQRT_TAU, chance / (2.0 * options.threshold_px))
 
@@ -219,6 +221,7 @@ def _homography(
     pixels0: Array, pixels1: Array, key: Any, options: RansacOptions, sigma_px: Any, quality: Any, mask: Any
 ) -> Estimate[Array]:
     pixels0, pixels1, mask = masked_pairs(pixels0, pixels1, mask)
+    sigma_px, mask = usable_noise(sigma_px, mask)
     chance = chance_in_image(pixels1, mask, options.threshold_px)
     densities = (1.0 / SQRT_TAU**2, chance / (jnp.pi * options.threshold_px**2))
 

@@ -34,7 +34,7 @@ class RansacOptions:
 
     def __post_init__(self) -> None:
         for name in ("threshold_px", "threshold"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a positive number")
         if not 0 < self.confidence < 1:
             raise ValueError(f"confidence is {self.confidence}: expected a probability between 0 and 1, both excluded")

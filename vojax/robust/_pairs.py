@@ -68,8 +68,54 @@ def noise_factors(sigma_px: Any, n: int, dtype: Any) -> tuple[Float[Array, "n 2 
     return factor[:, 0], factor[:, 1]
 
 
+def check_sigma(sigma: Any, n: int) -> None:
+    """Refuse noise that is a plain number and not positive (arrays may be traced), or of another number of rows.
+
+    Raises:
+        ValueError: If it is so.
+    """
+    if isinstance(sigma, (int, float)):
+        if not 0 < sigma < float("inf"):
+            raise ValueError(f"the standard deviation is {sigma}: expected a positive number")
+    elif jnp.ndim(sigma) and jnp.shape(sigma)[0] != n:
+        raise ValueError(f"the noise has shape {jnp.shape(sigma)}: expected () or one entry for each of {n} rows")
+
+
+def usable_noise(sigma: Any, mask: Bool[Array, " n"]) -> tuple[Any, Bool[Array, " n"]]:
+    """Noise that can be divided by, and which rows count: those whose noise is positive and finite.
+
+    Args:
+        sigma: One standard deviation, one for each row, or covariances `[n, ..., d, d]`.
+        mask: Rows that count.
+
+    Returns:
+        The noise, one (or the identity) in rows that do not count, and those that do.
+
+    Raises:
+        ValueError: As `check_sigma`.
+    """
+    check_sigma(sigma, mask.shape[0])
+    if isinstance(sigma, (int, float)):
+        return sigma, mask
+    sigma = jnp.asarray(sigma)
+    if sigma.ndim < 2:
+        good = mask & (sigma > 0) & jnp.isfinite(sigma)
+        return jnp.where(good if sigma.ndim else jnp.any(good), sigma, 1.0), good
+    d = sigma.shape[-1]
+    axes = tuple(range(1, sigma.ndim))
+    variances = jnp.diagonal(sigma, axis1=-2, axis2=-1)
+    good = jnp.all(jnp.isfinite(sigma), axis=axes) & jnp.all(variances > 0, axis=axes[:-1])
+    identity = jnp.broadcast_to(jnp.eye(d, dtype=sigma.dtype), sigma.shape)
+    return jnp.where(good.reshape(-1, *(1 for _ in axes)), sigma, identity), mask & good
+
+
 def root_mean_square(sigma_px: Any, mask: Bool[Array, " n"]) -> Float[Array, ""]:
-    """One standard deviation that stands for all, whatever form they come in; constant to differentiation."""
+    """One standard deviation that stands for all, whatever form they come in; constant to differentiation.
+
+    Raises:
+        ValueError: As `check_sigma`.
+    """
+    check_sigma(sigma_px, mask.shape[0])
     sigma = jax.lax.stop_gradient(jnp.asarray(sigma_px))
     if sigma.ndim == 0:
         return sigma
@@ -128,7 +174,13 @@ def checked_observations(points_world: Any, pixels: Any) -> tuple[Float[Array, "
 
 
 def masked_pairs(first: Array, second: Array, mask: Any) -> tuple[Array, Array, Bool[Array, " n"]]:
-    """Zeros in rows that do not count or are not finite, and which rows count."""
+    """Zeros in rows that do not count or are not finite, and which rows count.
+
+    Raises:
+        ValueError: If the mask does not fit the rows.
+    """
+    if mask is not None and jnp.shape(mask) != first.shape[:1]:
+        raise ValueError(f"mask has shape {jnp.shape(mask)}: expected one entry for each of {len(first)} rows")
     finite = jnp.all(jnp.isfinite(first), axis=1) & jnp.all(jnp.isfinite(second), axis=1)
     mask = finite if mask is None else finite & jnp.asarray(mask)
     return jnp.where(mask[:, None], first, 0.0), jnp.where(mask[:, None], second, 0.0), mask

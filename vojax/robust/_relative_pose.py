@@ -30,7 +30,15 @@ from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import checked_pairs, masked_pairs, matrix_rows, pair_rays, root_mean_square, single_precision
+from ._pairs import (
+    checked_pairs,
+    masked_pairs,
+    matrix_rows,
+    pair_rays,
+    root_mean_square,
+    single_precision,
+    usable_noise,
+)
 from ._significance import SQRT_TAU, chance_near_line, even_odds
 
 
@@ -129,6 +137,7 @@ def _estimate(
     mask: Any,
 ) -> Estimate[SE3]:
     pixels0, pixels1, mask = masked_pairs(pixels0, pixels1, mask)
+    sigma_px, mask = usable_noise(sigma_px, mask)
     essential, consensus = search_relative_pose(pixels0, pixels1, camera0, camera1, mask, quality, key, options)
     view0, view1 = pair_rays(pixels0, pixels1, camera0, camera1, sigma_px)
     rays0, rays1 = jax.lax.stop_gradient([jnp.stack(view.ray, axis=1) for view in (view0, view1)])

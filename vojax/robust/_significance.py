@@ -39,12 +39,16 @@ def is_significant(
     return enough & (log_alarms < 0)
 
 
-def chance_in_image(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
+def chance_in_image(
+    pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: Float[Array, ""] | float
+) -> Float[Array, ""]:
     """Probability that a random pixel lies within the threshold of another; pixels fill their bounding box."""
     return jnp.minimum(jnp.pi * threshold_px**2 / jnp.prod(_box(pixels, mask, threshold_px)), 1.0)
 
 
-def chance_near_line(pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: float) -> Float[Array, ""]:
+def chance_near_line(
+    pixels: Float[Array, "n 2"], mask: Bool[Array, " n"], threshold_px: Float[Array, ""] | float
+) -> Float[Array, ""]:
     """Probability that a random pixel lies within the threshold of a line; pixels fill their bounding box.
 
     A line crosses the box along its diagonal at most.
@@ -58,7 +62,9 @@ def chance_in_box(points: Float[Array, "n 3"], mask: Bool[Array, " n"], threshol
     return jnp.minimum(4.0 / 3.0 * jnp.pi * threshold**3 / jnp.prod(_box(points, mask, threshold)), 1.0)
 
 
-def _box(points: Float[Array, "n d"], mask: Bool[Array, " n"], threshold: float) -> Float[Array, "d"]:
+def _box(
+    points: Float[Array, "n d"], mask: Bool[Array, " n"], threshold: Float[Array, ""] | float
+) -> Float[Array, "d"]:
     """Size of the bounding box; one thinner than a disc of the threshold counts with the disc's width."""
     low = jnp.min(jnp.where(mask[:, None], points, jnp.inf), axis=0)
     high = jnp.max(jnp.where(mask[:, None], points, -jnp.inf), axis=0)

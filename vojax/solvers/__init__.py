@@ -42,7 +42,7 @@ from ._p3p import p3p as p3p
 from ._p3p_grunert import p3p_grunert as p3p_grunert
 from ._p4pf import FocalCamera as FocalCamera
 from ._p4pf import p4pf as p4pf
-from ._p5pfr import RadialCamera as RadialCamera
+from ._p4pfr import p4pfr as p4pfr
 from ._p5pfr import p5pfr as p5pfr
 from ._planar_two_point import planar_two_point as planar_two_point
 from ._plane_motions import align_2d_covariance as align_2d_covariance
@@ -53,6 +53,7 @@ from ._procrustes import procrustes as procrustes
 from ._procrustes_anisotropic import alignment_covariance as alignment_covariance
 from ._procrustes_anisotropic import procrustes_anisotropic as procrustes_anisotropic
 from ._procrustes_quaternion import procrustes_quaternion as procrustes_quaternion
+from ._radial_camera import RadialCamera as RadialCamera
 from ._rigid_three_point import rigid_three_point as rigid_three_point
 from ._rotation import rotation_from_rays as rotation_from_rays
 from ._seven_point import seven_point as seven_point

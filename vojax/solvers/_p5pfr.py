@@ -1,65 +1,52 @@
 """Pose, focal length and one coefficient of radial distortion from five points.
 
-Radial distortion moves pixels (u, v) towards the principal point or away from it, so that whatever the focal length and
-the distortion the point lies in the half plane of its pixel (radial alignment):
+Whatever the focal length and the distortion, a point lies in the half plane of its pixel (radial alignment). Five of
+these equations leave the first two rows of s [R | t] a combination of three null vectors, and
 
-    u (r2 · X + t2) - v (r1 · X + t1) = 0,      u (r1 · X + t1) + v (r2 · X + t2) > 0.                             (1)
+    p1 · p2 = 0,      |p1|² - |p2|² = 0                                                                            (1)
 
-Five of these equations leave the first two rows of s [R | t] a combination of three null vectors, and
-
-    p1 · p2 = 0,      |p1|² - |p2|² = 0                                                                            (2)
-
-are two conics in its coefficients: a quartic. With λ = (u x + v y) / (u² + v²), x = r1 · X + t1, y = r2 · X + t2, the
-division model (x, y) / z = (u, v) / (f (1 + k (u² + v²))) makes the rest linear,
-
-    f λ + (f k) (u² + v²) λ - t3 = r3 · X,                                                                         (3)
-
-five equations for f, f k and t3, solved in the least-squares sense.
+are two conics in its coefficients: a quartic. The rest is linear, five equations for f, f k and t3, solved in the
+least-squares sense; see `_radial_camera.py`.
 
 Precondition: pixels relative to the centre of distortion, which is the principal point, and square.
 
 References:
     Z. Kukelova, M. Bujnak, T. Pajdla. Real-time solution to the absolute pose problem with unknown radial distortion
-    and focal length. ICCV 2013. R. Tsai. A versatile camera calibration technique. 1987 (radial alignment).
+    and focal length. ICCV 2013.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cross3, dot3, lane_sum, safe_divide, symmetric_inverse
+from vojax._numerics import cross3, dot3, lane_sum
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
 from ._candidates import Candidates
-from ._components import floor, quaternion_from_rotation, rotate, sign, squared
-from ._implicit import implicit, perturb_camera
+from ._components import floor, squared
+from ._implicit import implicit
 from ._lanes import lanes_last, one_kernel
 from ._null_space import null_space_and_rank
+from ._radial_camera import (
+    Data,
+    RadialCamera,
+    cameras_from_rows,
+    distinct,
+    errors,
+    normalised,
+    perturb,
+    points_and_pixels,
+    rows_from,
+    with_placeholders,
+)
 from ._roots import quartic_roots
 
-Data = tuple[Array, Array]
 SLOTS = 4
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-class RadialCamera(NamedTuple):
-    """A camera with square pixels and one coefficient of radial distortion, with its pose.
-
-    Attributes:
-        cam_from_world: The pose.
-        focal: Focal length in pixels.
-        distortion: k of the division model, (x, y) / z = (u, v) / (f (1 + k (u² + v²))), in pixels to the power -2.
-    """
-
-    cam_from_world: SE3
-    focal: Float[Array, "*batch"]
-    distortion: Float[Array, "*batch"]
-
-
 def _conics(basis: Array) -> tuple[Array, Array]:
-    """Coefficients [6, *lanes] of (2) for null vectors [3, 2, 4, *lanes], of length one."""
+    """Coefficients [6, *lanes] of (1) for null vectors [3, 2, 4, *lanes], of length one."""
     conics = []
     for mixed in (True, False):
         entries = []
@@ -136,99 +123,20 @@ def _newton(point: Array, a: Array, b: Array) -> Array:
 
 def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     """Poses [4, 7, *lanes], focal lengths and distortions [2, 4, *lanes], and validity [4, *lanes]."""
-    dtype = points.dtype
-    double = dtype == jnp.float64
-    eps = float(jnp.finfo(dtype).eps)
-    usable = jnp.all(jnp.isfinite(points), axis=(0, 1)) & jnp.all(jnp.isfinite(pixels), axis=(0, 1))
-    points, pixels = (jnp.where(usable[None, None], a, 0.0) for a in (points, pixels))
-    mean = points[0] + lane_sum(points - points[:1], axis=0) / 5.0
-    x = points - mean[None]
-    spread, radius = jnp.max(jnp.abs(x), axis=(0, 1)), jnp.max(jnp.abs(pixels), axis=(0, 1))
-    reach = jnp.max(jnp.abs(points), axis=(0, 1))
-    usable = usable & (spread > 16.0 * eps * reach) & (spread > floor(spread) ** 2) & (radius > floor(radius) ** 2)
-    usable = usable & (reach < 1.0 / floor(reach) ** 2) & (radius < 1.0 / floor(radius) ** 2)
-    unit, radius = jnp.where(usable, spread, 1.0), jnp.where(usable, radius, 1.0)
-    x, u = x / unit[None, None], pixels / radius[None, None]
-
-    h = jnp.concatenate([x, jnp.ones_like(x[:, :1])], axis=1)
-    basis, independent = null_space_and_rank(jnp.concatenate([-u[:, 1:] * h, u[:, :1] * h], axis=1))
-    basis = basis.reshape(3, 2, 4, *usable.shape)
+    double = points.dtype == jnp.float64
+    eps = float(jnp.finfo(points.dtype).eps)
+    problem = normalised(points, pixels)
+    basis, independent = null_space_and_rank(problem.alignment)
+    basis = basis.reshape(3, 2, 4, *problem.usable.shape)
     a, b = _conics(basis)
     point, valid = _meet(a, b)
     point = jax.lax.fori_loop(0, 4 if double else 3, lambda _, c: _newton(c, a, b), point)
-    p = lane_sum(basis[:, :, :, None] * point[:, None, None], axis=0)  # [2, 4, slots, *lanes]
-    norms = [jnp.sqrt(squared((p[i, 0], p[i, 1], p[i, 2]))) for i in range(2)]
-    size = jnp.sqrt(0.5 * (norms[0] * norms[0] + norms[1] * norms[1]))
-    valid = valid & (usable & independent)[None] & (size > 64.0 * eps)
-    # (2) holds to rounding at a common point.
-    tolerance = 4096.0 if double else 64.0
-    gap = jnp.abs(norms[0] * norms[0] - norms[1] * norms[1])
-    gap = jnp.maximum(gap, jnp.abs(dot3((p[0, 0], p[0, 1], p[0, 2]), (p[1, 0], p[1, 1], p[1, 2]))))
-    valid = valid & (gap <= tolerance * eps)
-    size = jnp.where(valid, size, 1.0)
-
-    along = jnp.stack(
-        [
-            sum((u[n, 0] * h[n, c])[None] * p[0, c] + (u[n, 1] * h[n, c])[None] * p[1, c] for c in range(4))
-            for n in range(5)
-        ]
-    )  # [5, slots, *lanes]: u x + v y, of one sign
-    side = sign(along[0])
-    valid = valid & jnp.all(along * side[None] > 0, axis=0)
-    p = p * (side / size)[None, None]
-    first = (p[0, 0], p[0, 1], p[0, 2])
-    norm = jnp.sqrt(squared(first))
-    first = tuple(c / jnp.where(valid, norm, 1.0) for c in first)
-    second: tuple[Array, ...] = (p[1, 0], p[1, 1], p[1, 2])
-    inner = dot3(first, second)
-    second = tuple(c - inner * d for c, d in zip(second, first, strict=True))
-    norm = jnp.sqrt(squared(second))
-    second = tuple(c / jnp.where(valid, norm, 1.0) for c in second)
-    third = cross3(first, second)
-    quaternion = quaternion_from_rotation((first, second, third))
-
-    square = lane_sum(u * u, axis=1)  # [5, *lanes]
-    centred = square > 64.0 * eps
-    usable_square = jnp.where(centred, square, 1.0)
-    # A pixel in the centre says nothing in (3).
-    scaled = jnp.where(centred[:, None], along * (side / size)[None] / usable_square[:, None], 0.0)
-    # Rows of (3) times u² + v², so that pixels near the centre do not rule; the unknowns are f, f k and t3.
-    columns = jnp.stack(
-        [scaled * square[:, None], scaled * (square * square)[:, None], -square[:, None] * jnp.ones_like(scaled)]
-    )
-    heights = jnp.stack([sum(third[c] * x[n, c][None] for c in range(3)) for n in range(5)]) * square[:, None]
-    scale = jnp.sqrt(lane_sum(columns * columns, axis=1))
-    columns = columns / jnp.where(scale > 0, scale, 1.0)[:, None]
-    normal = lane_sum(columns[:, None] * columns[None], axis=2)
-    inverse, regular = symmetric_inverse(normal, lane_sum)
-    solution = [jnp.zeros_like(size)] * 3
-    for _ in range(2):  # the second time for what rounding left
-        left = heights - sum(columns[c] * solution[c][None] for c in range(3))
-        rhs = lane_sum(columns * left[None], axis=1)
-        solution = [solution[c] + sum(inverse[c, d] * rhs[d] for d in range(3)) for c in range(3)]
-    focal, product, depth = (solution[c] / jnp.where(scale[c] > 0, scale[c], 1.0) for c in range(3))
-    valid = valid & regular & (focal > floor(focal))
-    distortion = product / jnp.where(valid, focal, 1.0)
-    # In front, and on the side of the distortion where radii are positive.
-    reach5 = 1.0 + distortion[None] * square[:, None]
-    in_front = jnp.stack([sum(third[c] * x[n, c][None] for c in range(3)) + depth for n in range(5)])
-    valid = valid & jnp.all((reach5 > 0) & (in_front > 0), axis=0)
-
-    offset = rotate(quaternion, tuple(mean[c][None] for c in range(3)))
-    t = (p[0, 3], p[1, 3], depth)
-    model = jnp.stack([*quaternion, *(unit[None] * t[c] - offset[c] for c in range(3))], axis=1)
-    focal = focal * radius[None]
-    distortion = distortion / (radius * radius)[None]
-    valid = valid & jnp.all(jnp.isfinite(model), axis=1) & jnp.isfinite(focal) & jnp.isfinite(distortion)
-    # A point met twice counts once.
-    inner = jnp.abs(lane_sum(point[:, :, None] * point[:, None], axis=0))
-    near = 1.0 - inner < (0.5 if double else 2.0) * eps
-    slots = jnp.arange(SLOTS)
-    before = (slots[:, None] < slots[None]).reshape(SLOTS, SLOTS, *(1,) * usable.ndim)
-    valid = valid & ~jnp.any(near & before & valid[:, None], axis=0)
-    identity = jnp.eye(7, dtype=dtype)[0].reshape(1, 7, *(1,) * usable.ndim)
-    intrinsics = jnp.stack([jnp.where(valid, focal, 1.0), jnp.where(valid, distortion, 0.0)])
-    return jnp.where(valid[:, None], model, identity), intrinsics, valid
+    rows, size, gap = rows_from(basis, point)
+    # (1) holds to rounding at a common point.
+    valid = valid & (problem.usable & independent)[None] & (size > 64.0 * eps)
+    valid = valid & (gap <= (4096.0 if double else 64.0) * eps)
+    model, intrinsics, valid, _ = cameras_from_rows(rows, size, valid, problem)
+    return with_placeholders(model, intrinsics, distinct(point, valid))
 
 
 _solve = lanes_last(one_kernel(_kernel), chunk=128)
@@ -239,38 +147,14 @@ def _candidates(data: Data) -> Candidates[RadialCamera]:
     return Candidates(models=RadialCamera(SE3(poses), intrinsics[0], intrinsics[1]), valid=valid)
 
 
-def _perturb(model: RadialCamera, tangent: Array) -> RadialCamera:
-    # f and f k move in their own unit: that of the pixels.
-    focal = model.focal * (1.0 + tangent[6])
-    return RadialCamera(
-        perturb_camera(model.cam_from_world, tangent[:6]), focal, model.distortion + tangent[7] / (model.focal**2)
-    )
-
-
 def _equations(model: RadialCamera, data: Data) -> Array:
-    """Eight equations: five of (1), and the three normal equations of (3) weighted by u² + v²."""
-    points_world, pixels = data
-    radius = jax.lax.stop_gradient(jnp.max(jnp.abs(pixels)))
-    usable = radius > 0
-    inverse = jnp.where(usable, 1.0 / jnp.where(usable, radius, 1.0), 1.0)
-    u = pixels * inverse
-    focal, distortion = model.focal * inverse, safe_divide(model.distortion, inverse * inverse)
-    y = model.cam_from_world @ points_world
-    square = jnp.sum(u * u, axis=1)
-    radial = u[:, 0] * y[:, 1] - u[:, 1] * y[:, 0]
-    weighted = jnp.sum(u * y[:, :2], axis=1)  # λ (u² + v²)
-    error = focal * weighted * (1.0 + distortion * square) - y[:, 2] * square
-    return jnp.concatenate(
-        [
-            radial,
-            jnp.sum(error * weighted)[None],
-            jnp.sum(error * weighted * square)[None],
-            jnp.sum(error * square)[None],
-        ]
-    )
+    """Eight equations: five of radial alignment, and the normal equations of the others."""
+    radial, error, weighted, square = errors(model, data)
+    normal = [jnp.sum(error * weighted), jnp.sum(error * weighted * square), jnp.sum(error * square)]
+    return jnp.concatenate([radial, jnp.stack(normal)])
 
 
-_p5pfr = implicit(_candidates, _equations, _perturb, 8)
+_p5pfr = implicit(_candidates, _equations, perturb, 8)
 
 
 def p5pfr(points_world: Float[ArrayLike, "5 3"], pixels: Float[ArrayLike, "5 2"]) -> Candidates[RadialCamera]:
@@ -297,15 +181,4 @@ def p5pfr(points_world: Float[ArrayLike, "5 3"], pixels: Float[ArrayLike, "5 2"]
         ValueError: If there are not five points and five pixels.
     References: see the module.
     """
-    return _p5pfr(five_of_each(points_world, pixels))
-
-
-def five_of_each(points_world: ArrayLike, pixels: ArrayLike) -> Data:
-    """Arrays of one dtype; refuses other shapes."""
-    points_world, pixels = jnp.asarray(points_world), jnp.asarray(pixels)
-    if points_world.shape != (5, 3) or pixels.shape != (5, 2):
-        raise ValueError(
-            f"found points {points_world.shape} and pixels {pixels.shape}; expected five of each, (5, 3) and (5, 2)"
-        )
-    dtype = jnp.result_type(points_world, pixels)
-    return points_world.astype(dtype), pixels.astype(dtype)
+    return _p5pfr(points_and_pixels(points_world, pixels, 5, "five"))

@@ -20,6 +20,7 @@ References:
 
 import functools
 import operator
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +37,9 @@ SLOTS = 8
 # Monomials of a quadric, as pairs of the unknowns.
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
 _INDEX = {pair: k for k, pair in enumerate(PAIRS)}
-# Which unknowns are x, w, y and z, by turns.
-_ORDERS = ((0, 3, 1, 2), (1, 2, 0, 3), (0, 1, 2, 3), (2, 3, 0, 1), (0, 2, 1, 3), (1, 3, 0, 2))
+# Which unknowns are x, w, y and z, by turns, and where the monomials then stand in PAIRS.
+ORDERS = ((0, 3, 1, 2), (1, 2, 0, 3), (0, 1, 2, 3), (2, 3, 0, 1), (0, 2, 1, 3), (1, 3, 0, 2))
+PLACES = tuple(tuple(_INDEX[min(o[i], o[j]), max(o[i], o[j])] for i, j in PAIRS) for o in ORDERS)
 
 
 def _add(*polynomials: Polynomial) -> Polynomial:
@@ -94,7 +96,7 @@ def orthonormal_rows(rows: Float[Array, "3 n *lanes"]) -> tuple[Float[Array, "3 
 def _permuted(quadrics: Array) -> tuple[Array, Array, Array]:
     """The quadrics with (y, z) chosen, the choice, and its determinant."""
     best, index = None, None
-    for k, (_, _, y, z) in enumerate(_ORDERS):
+    for k, (_, _, y, z) in enumerate(ORDERS):
         columns = [quadrics[:, _INDEX[pair]] for pair in ((y, y), (min(y, z), max(y, z)), (z, z))]
         # The coefficient of yz stands for two entries of the symmetric matrix.
         size = jnp.abs(_determinant3(*((c[0], c[1], c[2]) for c in columns)))
@@ -105,11 +107,10 @@ def _permuted(quadrics: Array) -> tuple[Array, Array, Array]:
             best = jnp.maximum(size, best)
     assert best is not None
     assert index is not None
-    tables = [[_INDEX[min(o[i], o[j]), max(o[i], o[j])] for i, j in PAIRS] for o in _ORDERS]
-    return _choose(quadrics, index, tables), index, best
+    return choose(quadrics, index, PLACES), index, best
 
 
-def _choose(x: Array, index: Array, tables: list[list[int]]) -> Array:
+def choose(x: Array, index: Array, tables: Sequence[Sequence[int]]) -> Array:
     """x[:, tables[index]] lane by lane, in a loop: its result is kept, that of selections is computed again."""
     places = jnp.asarray(tables)
 
@@ -117,6 +118,12 @@ def _choose(x: Array, index: Array, tables: list[list[int]]) -> Array:
         return jnp.where((index == k)[None, None], x[:, places[k]], chosen)
 
     return jax.lax.fori_loop(0, len(tables), step, x)
+
+
+def in_first_order(solution: Array, index: Array) -> Array:
+    """Unknowns (x, w, y, z) [4, slots, *lanes] back in their places."""
+    tables = [[order.index(i) for i in range(4)] for order in ORDERS]
+    return jnp.moveaxis(choose(jnp.moveaxis(solution, 1, 0), index, tables), 0, 1)
 
 
 def _monic(q: Array) -> tuple[Row, Row, Row]:
@@ -217,10 +224,10 @@ def _unit4(x: Array) -> Array:
     return x / jnp.where(size > floor(size), size, jnp.inf)[None]
 
 
-def _values(q: Array, x: Array) -> tuple[list[Array], list[list[Array]]]:
-    """The quadrics at points [4, slots, *lanes], and their gradients."""
+def quadric_values(q: Array, x: Array) -> tuple[list[Array], list[list[Array]]]:
+    """Quadrics [k, 10, *lanes] at points [4, slots, *lanes], and their gradients."""
     values, gradients = [], []
-    for k in range(3):
+    for k in range(q.shape[0]):
         gradient = []
         for i in range(4):
             terms = [(2.0 if i == j else 1.0) * q[k, _INDEX[min(i, j), max(i, j)]][None] * x[j] for j in range(4)]
@@ -230,10 +237,9 @@ def _values(q: Array, x: Array) -> tuple[list[Array], list[list[Array]]]:
     return values, gradients
 
 
-def _newton(q: Array, x: Array) -> Array:
-    """One step on the three quadrics along the unit sphere."""
+def newton_on_sphere(x: Array, values: list[Array], gradients: list[list[Array]]) -> Array:
+    """One step along the unit sphere of four unknowns, on three forms given by values and gradients."""
     eps = float(jnp.finfo(x.dtype).eps)
-    values, gradients = _values(q, x)
     a, b, c, d = x[0], x[1], x[2], x[3]
     # A basis of the tangent space of the sphere, as of the unit quaternions.
     tangents = ((-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
@@ -277,10 +283,9 @@ def three_quadrics(
     (u, v), valid = polynomial_roots(_octic(rows), SLOTS)
     y, z, w = _null_vector(rows, u, v)
     solution = _unit4(jnp.stack((u * w, v * w, y, z)))  # x, w, y, z
-    tables = [[order.index(i) for i in range(4)] for order in _ORDERS]
-    points = jnp.moveaxis(_choose(jnp.moveaxis(solution, 1, 0), index, tables), 0, 1)
-    points = jax.lax.fori_loop(0, newton_steps, lambda _, p: _newton(quadrics, p), points)
-    values, _ = _values(quadrics, points)
+    points = in_first_order(solution, index)
+    points = jax.lax.fori_loop(0, newton_steps, lambda _, p: newton_on_sphere(p, *quadric_values(quadrics, p)), points)
+    values, _ = quadric_values(quadrics, points)
     residual = jnp.maximum(jnp.maximum(jnp.abs(values[0]), jnp.abs(values[1])), jnp.abs(values[2]))
     valid = valid & (size > floor(size))[None] & (lane_sum(points * points, axis=0) > 0.5)
     # A point met twice counts once.

@@ -1,0 +1,209 @@
+"""Normal equations of a window on the full grid of cameras × landmarks, solved by eliminating the landmarks.
+
+The matrix is the block arrow [[U, W], [Wᵀ, V]] with V block diagonal over landmarks and U block diagonal over cameras
+but for a prior. With V = L Lᵀ and E = W L⁻ᵀ, eliminating the landmarks leaves S = U − E Eᵀ, six unknowns a camera
+(Szeliski, "Computer Vision", section 11.4.3).
+
+Landmarks are innermost: every small-matrix operation is elementwise over them. Unknowns of the cameras are ordered
+[6, cameras], so that E is a matrix as it stands and the only large product, E Eᵀ, is one matrix multiplication.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+
+from vojax._numerics import cholesky_factor
+from vojax._types import Array, Bool, Float
+
+from ._window_residual import Blocks, cross, dot
+
+
+class ArrowSystem(eqx.Module):
+    """Blocks of the normal equations and their right-hand side Jᵀr.
+
+    `coupling` is what a prior adds to the cameras' part, and is None without one.
+    """
+
+    camera: Float[Array, "6 6 c"]
+    landmark: Float[Array, "3 3 p"]
+    cross: Float[Array, "6 c 3 p"]
+    camera_gradient: Float[Array, "6 c"]
+    landmark_gradient: Float[Array, "3 p"]
+    coupling: Float[Array, "6 c 6 c"] | None
+
+    def camera_diagonal(self) -> Float[Array, "6 c"]:
+        """Diagonal of the cameras' part."""
+        diagonal = self.camera[jnp.arange(6), jnp.arange(6)]
+        if self.coupling is None:
+            return diagonal
+        return diagonal + _diagonal(self.coupling)
+
+    def damped(self, damping: Float[Array, ""]) -> "ArrowSystem":
+        """Scale the diagonal by 1 + λ."""
+        eye6, eye3 = jnp.eye(6, dtype=damping.dtype), jnp.eye(3, dtype=damping.dtype)
+        camera = self.camera + damping * eye6[..., None] * self.camera_diagonal()[None]
+        landmark = self.landmark * (1.0 + damping * eye3[..., None])
+        return eqx.tree_at(lambda system: (system.camera, system.landmark), self, (camera, landmark))
+
+
+class Reduced(eqx.Module):
+    """The camera system after elimination, factored."""
+
+    factor: Float[Array, "u u"]
+    scale: Float[Array, " u"]
+    eliminated: Float[Array, "u q"]
+    landmark_root: tuple[Array, ...]  # L⁻¹ of the landmark blocks, row by row
+    regular: Bool[Array, ""]
+
+    def solve_cameras(self, rhs: Float[Array, "u k"]) -> Float[Array, "u k"]:
+        """Solve S x = rhs."""
+        scaled = jax.scipy.linalg.cho_solve((self.factor, True), self.scale[:, None] * rhs)
+        return self.scale[:, None] * scaled
+
+
+def reduce(system: ArrowSystem) -> Reduced:
+    """Eliminate the landmarks and factor what is left.
+
+    Cameras without information (fixed, or seeing nothing) and landmarks without information get an increment of zero.
+    If S is not positive definite in working precision, `regular` is False and the factor is the identity.
+    """
+    c, p = system.camera.shape[-1], system.landmark.shape[-1]
+    root = _inverse_root(system.landmark)
+    spread = tuple(jnp.broadcast_to(entry[None, None], (6, c, p)) for entry in root)
+    eliminated = _times_root(spread, jnp.moveaxis(system.cross, 2, 0))
+    eliminated = jnp.moveaxis(eliminated, 0, 2).reshape(6 * c, 3 * p)
+    full = _spread(system.camera).reshape(6 * c, 6 * c)
+    if system.coupling is not None:
+        full = full + system.coupling.reshape(6 * c, 6 * c)
+    full = full - jnp.matmul(eliminated, eliminated.T, precision="highest")
+    # Jacobi scaling makes metres and radians comparable, which float32 needs.
+    diagonal = system.camera_diagonal().reshape(-1)
+    informed = diagonal > 0
+    scale = jnp.where(informed, jax.lax.rsqrt(jnp.where(informed, diagonal, 1.0)), 0.0)
+    scaled = scale[:, None] * full * scale[None, :] + jnp.diag(jnp.where(informed, 0.0, 1.0).astype(full.dtype))
+    factor = jnp.linalg.cholesky(scaled, symmetrize_input=False)
+    regular = jnp.all(jnp.isfinite(factor))
+    factor = jnp.where(regular, factor, jnp.eye(6 * c, dtype=full.dtype))
+    return Reduced(factor, scale, eliminated, root, regular)
+
+
+def solve(system: ArrowSystem) -> tuple[Float[Array, "6 c"], Float[Array, "3 p"]]:
+    """Solve the normal equations for −(camera, landmark) gradient.
+
+    Where the reduced system cannot be factored, the cameras' answer is the diagonally scaled gradient step, which is
+    finite.
+    """
+    c, p = system.camera.shape[-1], system.landmark.shape[-1]
+    reduced = reduce(system)
+    halved = _times_root(reduced.landmark_root, system.landmark_gradient).reshape(3 * p)
+    rhs = jnp.matmul(reduced.eliminated, halved, precision="highest") - system.camera_gradient.reshape(6 * c)
+    cameras = reduced.solve_cameras(rhs[:, None])[:, 0]
+    diagonal = system.camera_diagonal()
+    informed = diagonal > 0
+    fallback = jnp.where(informed, -system.camera_gradient / jnp.where(informed, diagonal, 1.0), 0.0)
+    cameras = jnp.where(reduced.regular, cameras, fallback.reshape(6 * c))
+    # V η = −g − Wᵀ ξ is Lᵀ η = −(L⁻¹ g + Eᵀ ξ).
+    halved = halved + jnp.matmul(cameras, reduced.eliminated, precision="highest")
+    return cameras.reshape(6, c), -_times_root_transposed(reduced.landmark_root, halved.reshape(3, p))
+
+
+def camera_covariances(system: ArrowSystem) -> tuple[Float[Array, "c 6 6"], Bool[Array, ""]]:
+    """Marginal covariances of the cameras: the diagonal blocks of S⁻¹; zero for cameras that are fixed."""
+    c = system.camera.shape[-1]
+    reduced = reduce(system)
+    full = reduced.solve_cameras(jnp.diag(jnp.where(reduced.scale > 0, 1.0, 0.0).astype(reduced.scale.dtype)))
+    blocks = jnp.sum(full.reshape(6, c, 6, c) * jnp.eye(c, dtype=full.dtype)[None, :, None], axis=3)
+    return jnp.where(reduced.regular, blocks.transpose(1, 0, 2), 0.0), reduced.regular
+
+
+def normal_equations(blocks: Blocks) -> ArrowSystem:
+    """Gauss–Newton's, from the derivatives in the observed points.
+
+    A point X in the camera's frame moves by −ρ − φ × X + R η, so with A = Σ aᵀa over the rows a of its derivative, the
+    rows of W are −A R and (A R) × X, and those of U follow with −1 and X × in place of R.
+    """
+    a, x, rotation, free = blocks.by_point, blocks.point, blocks.rotation, blocks.free
+    c, three, turn = free.shape[0], range(3), rotation[..., None]
+    # Components one by one, in the lanes, and stacked where they are used more than once: see `linearize`.
+    normal = [[sum(row[i] * row[j] for row in a) for j in three] for i in three]
+    normal = jnp.stack([jnp.stack(row) for row in normal])  # A: [3, 3, c, p]
+    by_point = jnp.stack([sum(row[i] * r for row, r in zip(a, blocks.residual, strict=True)) for i in three])
+    turned = jnp.stack([jnp.stack([dot(normal[i], turn[:, j]) for j in three]) for i in three])  # A R
+    rows = jnp.concatenate([-turned, cross(turned, x[:, None])])
+    by_turn = cross(normal, x[:, None])  # [X]×ᵀ A
+    corner = jnp.sum(cross(by_turn.swapaxes(0, 1), x[:, None]), axis=-1)
+    straight, mixed = jnp.sum(normal, axis=-1), -jnp.sum(by_turn, axis=-1)
+    camera = jnp.concatenate(
+        [jnp.concatenate([straight, mixed.swapaxes(0, 1)], axis=1), jnp.concatenate([mixed, corner], axis=1)]
+    )
+    camera_gradient = jnp.concatenate([-jnp.sum(by_point, axis=-1), jnp.sum(cross(by_point, x), axis=-1)])
+    landmark = [[jnp.sum(dot(turn[:, i], turned[:, j]), axis=0) for j in three] for i in three]
+    landmark_gradient = [jnp.sum(dot(turn[:, i], by_point), axis=0) for i in three]
+    prior = blocks.prior_by_pose
+    coupling = None
+    if prior.shape[0]:
+        m = prior.reshape(prior.shape[0], 6 * c)
+        coupling = jnp.matmul(m.T, m, precision="highest").reshape(6, c, 6, c)
+        change = jnp.matmul(blocks.prior_residual, m, precision="highest").reshape(6, c)
+    else:
+        change = jnp.zeros((), x.dtype)
+    return ArrowSystem(
+        camera * free[None, None],
+        jnp.stack([jnp.stack(row) for row in landmark]),
+        (rows * free[None, None, :, None]).swapaxes(1, 2),
+        camera_gradient * free[None] + change,
+        jnp.stack(landmark_gradient),
+        coupling,
+    )
+
+
+class SchurDescent(optx.AbstractDescent):
+    """Levenberg–Marquardt step of a window: landmarks eliminated, cameras solved densely, landmarks put back."""
+
+    def init(self, y: Any, f_info_struct: Any) -> ArrowSystem:
+        """Zeros of the right shape."""
+        blocks = f_info_struct
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(normal_equations, blocks))
+
+    def query(self, y: Any, f_info: Any, state: Any) -> ArrowSystem:
+        """Form the blocks at a newly accepted point."""
+        del y, state
+        return normal_equations(f_info.jac)
+
+    def step(self, step_size: Any, state: ArrowSystem) -> tuple[Any, optx.RESULTS]:
+        """Solve for the step at damping 1/step_size."""
+        return solve(state.damped(1.0 / step_size)), optx.RESULTS.successful
+
+
+def _diagonal(coupling: Float[Array, "6 c 6 c"]) -> Float[Array, "6 c"]:
+    c = coupling.shape[-1]
+    return jnp.diagonal(coupling.reshape(6 * c, 6 * c)).reshape(6, c)
+
+
+def _spread(blocks: Float[Array, "6 6 c"]) -> Float[Array, "6 c 6 c"]:
+    c = blocks.shape[-1]
+    on_diagonal = jnp.eye(c, dtype=bool)[None, :, None, :]
+    return jnp.where(on_diagonal, blocks.swapaxes(1, 2)[..., None], 0.0)
+
+
+def _inverse_root(matrix: Float[Array, "3 3 *lanes"]) -> tuple[Array, ...]:
+    """L⁻¹ of M = L Lᵀ, row by row; rows without information are zero."""
+    columns, inverse, _ = cholesky_factor(matrix)
+    a, b, c = inverse
+    low = -b * columns[0][1] * a
+    return a, low, b, -c * (columns[0][2] * a + columns[1][1] * low), -c * columns[1][1] * b, c
+
+
+def _times_root(root: tuple[Array, ...], x: Float[Array, "3 *lanes"]) -> Float[Array, "3 *lanes"]:
+    return jnp.stack(
+        [root[0] * x[0], root[1] * x[0] + root[2] * x[1], root[3] * x[0] + root[4] * x[1] + root[5] * x[2]]
+    )
+
+
+def _times_root_transposed(root: tuple[Array, ...], x: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
+    return jnp.stack(
+        [root[0] * x[0] + root[1] * x[1] + root[3] * x[2], root[2] * x[1] + root[4] * x[2], root[5] * x[2]]
+    )
