@@ -84,7 +84,9 @@ def _robust_rows(only: str | None, batch: int, console: Console) -> list[_bench_
     ]
     if not chosen:
         raise ValueError(f"no estimator is called {only!r}; leave --only out to see them all")
-    return [_bench_robust.measure(*item, batch) for item in _tracked(chosen, console)]
+    return [
+        _bench_robust.measure(name, estimator, share, batch) for name, estimator, share in _tracked(chosen, console)
+    ]
 
 
 def _tracked(items: list[Any], console: Console) -> Any:
