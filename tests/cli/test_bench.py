@@ -46,6 +46,7 @@ def test_every_robust_estimator_is_in_the_table():
     assert facades == set(estimators())
 
 
+@pytest.mark.slow
 def test_one_estimator_is_measured(tmp_path, capsys):
     file = tmp_path / "bench.json"
     assert main(["bench", "robust", "--batch", "4", "--only", "rigid", "--json", str(file)]) == 0
@@ -57,6 +58,7 @@ def test_one_estimator_is_measured(tmp_path, capsys):
         assert row["success"] == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(estimators()))
 def test_problems_of_the_table_can_be_solved(name):
     estimator = estimators()[name]
