@@ -22,7 +22,9 @@ def pair(views, board):
     with jax.enable_x64(True):
         cameras = (Pinhole(500.0, 505.0, 318.0, 242.0), Pinhole(530.0, 528.0, 322.0, 238.0))
         right_from_left = SE3.exp(jnp.array([-1.2, 0.05, 0.1, 0.02, -0.08, 0.01]))
-        poses = (views[1], SE3(jnp.tile(right_from_left.wxyz_xyz[None], (8, 1))) @ views[1])
+        # Farther than one camera needs it: both have to see the whole board.
+        left = SE3(views[1].wxyz_xyz + jnp.zeros(7).at[6].set(2.5)[None])
+        poses = (left, SE3(jnp.tile(right_from_left.wxyz_xyz[None], (8, 1))) @ left)
         corners = np.stack(
             [
                 [np.asarray(camera.project(SE3(pose).apply(jnp.asarray(board)))) for pose in own.wxyz_xyz]
