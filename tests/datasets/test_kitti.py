@@ -159,6 +159,16 @@ def test_damaged_image_is_an_error_when_read(tmp_path):
         sequence.images(2)
 
 
+def test_calibration_for_images_of_another_size(tmp_path):
+    (write_sequence(tmp_path) / "calib.txt").write_text(
+        f"P0: {ROW.format(0)}\nP1: {ROW.format(-350)}\n".replace(" 60 ", " 120 ")
+    )
+    sequence = KittiSequence(tmp_path, "07")
+    with pytest.raises(ValueError, match=r"000000\.png has 120×60 pixels .* principal point at \(120, 30\)") as caught:
+        sequence.images(0)
+    one_line(caught)
+
+
 @pytest.mark.data
 def test_real_sequences(data_root):
     sequence = KittiSequence(data_root / "kitti", "06")

@@ -6,8 +6,13 @@ from ._colmap import ColmapBundle as ColmapBundle
 from ._colmap import ColmapModel as ColmapModel
 from ._colmap import read_colmap as read_colmap
 from ._colmap import write_colmap as write_colmap
+from ._euroc import EurocSequence as EurocSequence
+from ._images import ImageSequence as ImageSequence
 from ._kitti import KittiSequence as KittiSequence
 from ._motion import motion_profile as motion_profile
+from ._sequence import DepthSequence as DepthSequence
+from ._sequence import FrameSequence as FrameSequence
+from ._seven_scenes import SevenScenesSequence as SevenScenesSequence
 from ._simulator import AbsolutePoseProblem as AbsolutePoseProblem
 from ._simulator import RelativePoseProblem as RelativePoseProblem
 from ._simulator import RigidProblem as RigidProblem
@@ -17,3 +22,8 @@ from ._simulator import simulate_relative_pose as simulate_relative_pose
 from ._simulator import simulate_rigid as simulate_rigid
 from ._simulator import simulate_stereo_window as simulate_stereo_window
 from ._synthetic import SyntheticStereoSequence as SyntheticStereoSequence
+from ._tracks import PlanarTracks as PlanarTracks
+from ._tracks import StereoTracks as StereoTracks
+from ._tracks import read_planar_tracks as read_planar_tracks
+from ._tracks import read_stereo_tracks as read_stereo_tracks
+from ._tum import TumSequence as TumSequence

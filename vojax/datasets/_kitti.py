@@ -9,7 +9,9 @@ from jaxtyping import Float64
 from vojax.cameras import Pinhole, RectifiedStereo
 from vojax.features import read_image
 
-_SUFFIXES = (".png", ".jpg", ".jpeg")
+from ._pictures import check_index, check_size, image_files
+from ._poses import check_rotations
+from ._text import numbers, read_times, text_lines
 
 
 class KittiSequence:
@@ -51,7 +53,7 @@ class KittiSequence:
         root = pathlib.Path(root)
         self.name = str(sequence)
         folder = _sequence_folder(root, self.name)
-        self._left = _image_files(folder / "image_0")
+        self._left = image_files(folder / "image_0")
         self._right = None
         if stereo:
             if not (folder / "image_1").is_dir():
@@ -59,11 +61,11 @@ class KittiSequence:
                     f"{folder} has no image_1: expected the right images there; open it with stereo=False or choose a "
                     "monocular pipeline"
                 )
-            self._right = _image_files(folder / "image_1")
+            self._right = image_files(folder / "image_1")
             _check_pairs(folder, self._left, self._right)
         self.frame_names = [path.stem for path in self._left]
         self.camera, self.stereo = _calibration(folder / "calib.txt", stereo)
-        self.times = _times(folder / "times.txt", len(self))
+        self.times = read_times(folder / "times.txt", len(self))
         self.poses = _poses(root / "poses" / f"{self.name}.txt", len(self))
 
     def __len__(self) -> int:
@@ -81,11 +83,12 @@ class KittiSequence:
 
         Raises:
             IndexError: There is no such frame.
-            ValueError: An image is damaged, or left and right differ in size.
+            ValueError: An image is damaged, is not of the size that the calibration is for, or left and right differ in
+                size.
         """
-        if not -len(self) <= k < len(self):
-            raise IndexError(f"frame {k} of sequence {self.name}: expected 0 to {len(self) - 1}")
+        k = check_index(k, len(self), self.name)
         left = read_image(self._left[k])
+        check_size(left, self._left[k], self.camera)
         if self._right is None:
             return left, None
         right = read_image(self._right[k])
@@ -109,15 +112,6 @@ def _sequence_folder(root: pathlib.Path, name: str) -> pathlib.Path:
     return folder
 
 
-def _image_files(folder: pathlib.Path) -> list[pathlib.Path]:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder} not found: expected a folder of images 000000.png, 000001.png, …")
-    files = sorted((path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES), key=lambda path: path.stem)
-    if not files:
-        raise FileNotFoundError(f"{folder} holds no images: expected 000000.png, 000001.png, …")
-    return files
-
-
 def _check_pairs(folder: pathlib.Path, left: list[pathlib.Path], right: list[pathlib.Path]) -> None:
     if len(left) != len(right):
         raise ValueError(
@@ -129,35 +123,13 @@ def _check_pairs(folder: pathlib.Path, left: list[pathlib.Path], right: list[pat
             raise ValueError(f"{folder}: image_0 has {one.name} where image_1 has {other.name}: expected equal names")
 
 
-def _read_lines(path: pathlib.Path, expected: str) -> list[str]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path} not found: expected {expected}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read ({type(error).__name__}): expected {expected}") from None
-    return [line for line in text.splitlines() if line.strip()]
-
-
-def _numbers(words: list[str], count: int, where: str) -> np.ndarray:
-    if len(words) != count:
-        raise ValueError(f"{where} has {len(words)} columns: expected {count} numbers")
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        raise ValueError(f"{where} holds something that is not a number: expected {count} numbers") from None
-    if not np.isfinite(values).all():
-        raise ValueError(f"{where} holds NaN or infinity: expected {count} finite numbers")
-    return values
-
-
 def _calibration(path: pathlib.Path, stereo: bool) -> tuple[Pinhole, RectifiedStereo | None]:
     needed = ("P0", "P1") if stereo else ("P0",)
     rows: dict[str, np.ndarray] = {}
-    for line in _read_lines(path, "rows 'P0:' and 'P1:' of 12 numbers each"):
+    for _, line in text_lines(path, "rows 'P0:' and 'P1:' of 12 numbers each"):
         key, _, values = line.partition(":")
         if key.strip() in needed:
-            rows[key.strip()] = _numbers(values.split(), 12, f"{path}, row {key.strip()},").reshape(3, 4)
+            rows[key.strip()] = numbers(values.split(), 12, f"{path}, row {key.strip()},").reshape(3, 4)
     for key in needed:
         if key not in rows:
             raise ValueError(f"{path} has no row '{key}:': expected 'P0:' and 'P1:' with 12 numbers each")
@@ -182,33 +154,16 @@ def _calibration(path: pathlib.Path, stereo: bool) -> tuple[Pinhole, RectifiedSt
     return camera, RectifiedStereo(camera, float(baseline))
 
 
-def _times(path: pathlib.Path, frames: int) -> np.ndarray:
-    lines = _read_lines(path, "one time in seconds per frame")
-    times = np.array([_numbers(line.split(), 1, f"{path}, line {i + 1},")[0] for i, line in enumerate(lines)])
-    if len(times) != frames:
-        raise ValueError(f"{path} has {len(times)} times for {frames} images: expected one per frame")
-    if np.any(np.diff(times) <= 0):
-        i = int(np.argmax(np.diff(times) <= 0))
-        raise ValueError(f"{path}, line {i + 2}: {times[i + 1]:g} s follows {times[i]:g} s: expected increasing times")
-    return times
-
-
 def _poses(path: pathlib.Path, frames: int) -> np.ndarray | None:
     if not path.is_file():
         return None
-    lines = _read_lines(path, "12 numbers per frame")
-    rows = [_numbers(line.split(), 12, f"{path}, line {i + 1},") for i, line in enumerate(lines)]
+    lines = text_lines(path, "12 numbers per frame")
+    rows = [numbers(line.split(), 12, f"{path}, line {number},") for number, line in lines]
     if len(rows) != frames:
         raise ValueError(f"{path} has {len(rows)} poses for {frames} images: expected one per frame")
     poses = np.stack(rows).reshape(-1, 3, 4)
-    rotation = poses[:, :, :3]
     # The published poses carry seven digits.
-    deviation = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = (deviation > 1e-4) | (np.linalg.det(rotation) < 0)
-    if wrong.any():
-        i = int(np.argmax(wrong))
-        raise ValueError(
-            f"{path}, line {i + 1}: the left 3×3 block is not a rotation (off by {deviation[i]:.2g}): expected rows of "
-            "[R | t], world from camera"
-        )
+    check_rotations(
+        poses[:, :, :3], lambda i: f"{path}, line {lines[i][0]}", "rows of [R | t], world from camera", tolerance=1e-4
+    )
     return poses

@@ -11,3 +11,4 @@ from ._stereo import match_stereo_rows as match_stereo_rows
 from ._track import TrackerOptions as TrackerOptions
 from ._track import Tracks as Tracks
 from ._track import track as track
+from ._video import VideoReader as VideoReader
