@@ -1,4 +1,4 @@
-"""Drift over ten kilometres: frame to frame, windows that forget, and windows that marginalise (row 98).
+"""Drift over ten kilometres: frame to frame, windows that forget, and windows that marginalise.
 
 python benchmarks/study_windowed_drift.py [--seeds 20] [--length 10000] [--step 2] [--float32-too]
 

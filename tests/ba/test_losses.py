@@ -159,3 +159,12 @@ def test_huber_location_is_the_known_estimator(x64):
     found = scipy.optimize.brentq(lambda m: np.sum(np.clip(x - m, -1.345, 1.345)), -5, 10, xtol=1e-13)
     gradient = jax.jit(jax.grad(lambda m: 0.5 * jnp.sum(Huber().rho((jnp.asarray(x) - m) ** 2))))(found)
     assert abs(gradient) < 1e-10
+
+
+@all_losses
+def test_derivatives_up_to_the_third_are_finite_however_far_out(name, dtype):
+    loss, _ = ORACLES[name]
+    cost = lambda r: sum(c * c for c in robustify((r, 0.3 * r), loss))  # noqa: E731
+    third = jax.grad(jax.grad(jax.grad(cost)))
+    values = jax.jit(jax.vmap(lambda r: (cost(r), third(r))))(jnp.geomspace(1.0, 1e18, 64, dtype=dtype))
+    assert all(np.isfinite(v).all() for v in values)

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.solvers.derivatives import assert_derivatives
 from tests.solvers.problems import lanes, pose_errors, solve_in_batches
+from tests.solvers.unknown_intrinsics import DEGENERATE, mixed, spoiled
 from vojax.solvers import p4pf
 
 solve_last = jax.jit(jax.vmap(p4pf, in_axes=-1, out_axes=-1))
-DEGENERATE = ["one point", "one pixel", "collinear", "zeros", "nan", "inf"]
 
 
 def problems(count, seed=0, planar=False, tilt=0.5, sigma=0.0):
@@ -41,40 +41,6 @@ def recall(candidates, rotation, translation, focal, threshold):
     errors = pose_errors(candidates.models.cam_from_world.wxyz_xyz, rotation, translation)
     errors = np.maximum(errors, np.abs(candidates.models.focal / focal[:, None] - 1.0))
     return (np.where(candidates.valid, errors, np.inf).min(axis=1) < threshold).mean()
-
-
-def spoiled(points, pixels, kind):
-    points, pixels = points.copy(), pixels.copy()
-    if kind == "one point":
-        points[:] = points[:, :1]
-    elif kind == "one pixel":
-        pixels[:] = pixels[:, :1]
-    elif kind == "collinear":
-        points[:] = points[:, :1] + (points[:, 1:2] - points[:, :1]) * np.arange(4.0)[:, None]
-    elif kind == "zeros":
-        points[:], pixels[:] = 0.0, 0.0
-    elif kind == "nan":
-        points[:, 0, 2] = np.nan
-    elif kind == "inf":
-        pixels[:, 1, 0] = np.inf
-    elif kind == "two points":
-        points[:, 1], pixels[:, 1] = points[:, 0], pixels[:, 0]
-    elif kind == "three on a line":
-        points[:, 2] = 0.3 * points[:, 0] + 0.7 * points[:, 1]
-    elif kind == "huge":
-        points *= 1e30
-    elif kind == "tiny":
-        points, pixels = points * 1e-30, pixels * 1e-30
-    return points, pixels
-
-
-def mixed(seed, count):
-    """Random problems, half of them degenerate in one of several ways or absurd."""
-    points, pixels, *_ = problems(count, seed)
-    kinds = [*DEGENERATE, "two points", "three on a line", "huge", "tiny"]
-    for part, kind in zip(np.array_split(np.arange(count // 2), len(kinds)), kinds, strict=True):
-        points[part], pixels[part] = spoiled(points[part], pixels[part], kind)
-    return points, pixels
 
 
 def test_finds_the_truth(dtype):
@@ -147,7 +113,7 @@ def test_impossible_problems_have_no_valid_slot(dtype, kind):
 
 
 def test_nothing_is_infinite(dtype):
-    candidates = solve(*mixed(8, 2000), dtype)
+    candidates = solve(*mixed(*problems(2000, 8)[:2]), dtype)
     for x in jax.tree.leaves(candidates.models):
         assert np.isfinite(x).all()
     assert (candidates.models.focal[~candidates.valid] == 1.0).all()
@@ -157,7 +123,7 @@ def test_nothing_is_infinite(dtype):
 @pytest.mark.slow
 def test_nothing_is_ever_infinite(dtype):
     for seed in range(8):
-        for x in jax.tree.leaves(solve(*mixed(seed, 125_000), dtype).models):
+        for x in jax.tree.leaves(solve(*mixed(*problems(125_000, seed)[:2]), dtype).models):
             assert np.isfinite(x).all()
 
 
@@ -170,7 +136,7 @@ def test_gradients_equal_central_differences(x64, sigma):
 
 @pytest.mark.slow
 def test_gradients_are_finite_everywhere():
-    data = mixed(12, 2048)
+    data = mixed(*problems(2048, 12)[:2])
 
     def total(points, pixels):
         models = p4pf(points, pixels).models

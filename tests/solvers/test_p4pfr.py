@@ -5,7 +5,7 @@ import pytest
 
 from tests.solvers.derivatives import assert_derivatives
 from tests.solvers.problems import lanes, solve_in_batches
-from tests.solvers.radial_cameras import DEGENERATE, mixed, problems, recall, spoiled
+from tests.solvers.unknown_intrinsics import DEGENERATE, mixed, problems, recall, spoiled
 from vojax.solvers import p4pfr, p5pfr
 from vojax.solvers._radial_camera import points_and_pixels
 
@@ -85,7 +85,7 @@ def test_pixels_on_a_circle_say_nothing_about_distortion(dtype):
 
 
 def test_nothing_is_infinite(dtype):
-    candidates = solve(*mixed(8, 2000, points=4), dtype)
+    candidates = solve(*mixed(*problems(2000, 8, points=4)[:2]), dtype)
     for x in jax.tree.leaves(candidates.models):
         assert np.isfinite(x).all()
     assert (candidates.models.focal[~candidates.valid] == 1.0).all()
@@ -95,7 +95,7 @@ def test_nothing_is_infinite(dtype):
 @pytest.mark.slow
 def test_nothing_is_ever_infinite(dtype):
     for seed in range(8):
-        for x in jax.tree.leaves(solve(*mixed(seed, 125_000, points=4), dtype).models):
+        for x in jax.tree.leaves(solve(*mixed(*problems(125_000, seed, points=4)[:2]), dtype).models):
             assert np.isfinite(x).all()
 
 
@@ -107,7 +107,7 @@ def test_gradients_equal_central_differences(x64):
 
 @pytest.mark.slow
 def test_gradients_are_finite_everywhere():
-    data = mixed(12, 2048, points=4)
+    data = mixed(*problems(2048, 12, points=4)[:2])
 
     def total(points, pixels):
         models = p4pfr(points, pixels).models

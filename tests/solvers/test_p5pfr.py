@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.solvers.derivatives import assert_derivatives
 from tests.solvers.problems import lanes, solve_in_batches
-from tests.solvers.radial_cameras import DEGENERATE, mixed, problems, recall, spoiled
+from tests.solvers.unknown_intrinsics import DEGENERATE, mixed, problems, recall, spoiled
 from vojax.solvers import p5pfr
 from vojax.solvers._radial_camera import points_and_pixels
 
@@ -80,7 +80,7 @@ def test_impossible_problems_have_no_valid_slot(dtype, kind):
 
 
 def test_nothing_is_infinite(dtype):
-    candidates = solve(*mixed(8, 2000), dtype)
+    candidates = solve(*mixed(*problems(2000, 8)[:2]), dtype)
     for x in jax.tree.leaves(candidates.models):
         assert np.isfinite(x).all()
     assert (candidates.models.focal[~candidates.valid] == 1.0).all()
@@ -90,7 +90,7 @@ def test_nothing_is_infinite(dtype):
 @pytest.mark.slow
 def test_nothing_is_ever_infinite(dtype):
     for seed in range(8):
-        for x in jax.tree.leaves(solve(*mixed(seed, 125_000), dtype).models):
+        for x in jax.tree.leaves(solve(*mixed(*problems(125_000, seed)[:2]), dtype).models):
             assert np.isfinite(x).all()
 
 
@@ -102,7 +102,7 @@ def test_gradients_equal_central_differences(x64):
 
 @pytest.mark.slow
 def test_gradients_are_finite_everywhere():
-    data = mixed(12, 2048)
+    data = mixed(*problems(2048, 12)[:2])
 
     def total(points, pixels):
         models = p5pfr(points, pixels).models

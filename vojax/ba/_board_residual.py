@@ -17,10 +17,8 @@ from vojax._numerics import cross3, dot3
 from vojax._types import Array, Float
 from vojax.lie import SE3
 
+from ._intrinsics import Tied, add_to_camera, get_attribute
 from ._losses import Loss, robustify
-
-# Names of camera attributes that move together; a group of one is the common case.
-Tied = tuple[str, ...]
 
 
 class BoardState(eqx.Module):
@@ -64,26 +62,10 @@ class Tangent(NamedTuple):
     boards: Float[Array, "v 6"]
 
 
-def get_parameter(camera: Any, path: str) -> Any:
-    """A parameter by name; numbers in a dotted path index tuples."""
-    for part in path.split("."):
-        camera = camera[int(part)] if part.isdigit() else getattr(camera, part)
-    return camera
-
-
 def parameter_vector(cameras: Any, free: tuple[Tied, ...]) -> Float[Array, "c k"]:
     """Values of the free intrinsics, by the first name of each group."""
     first = jax.tree.leaves(cameras)[0]
-    return jnp.stack([get_parameter(cameras, names[0]) for names in free], 1) if free else first[:, None][:, :0]
-
-
-def add_to_cameras(cameras: Any, free: tuple[Tied, ...], change: Float[Array, "c k"]) -> Any:
-    """The cameras with their free intrinsics increased."""
-    for names, increment in zip(free, change.T, strict=True):
-        for name in names:
-            value = get_parameter(cameras, name) + increment
-            cameras = eqx.tree_at(lambda tree, name=name: get_parameter(tree, name), cameras, value)
-    return cameras
+    return jnp.stack([get_attribute(cameras, names[0]) for names in free], 1) if free else first[:, None][:, :0]
 
 
 def retract(state: BoardState, tangent: Tangent, free: tuple[Tied, ...]) -> BoardState:
@@ -93,7 +75,7 @@ def retract(state: BoardState, tangent: Tangent, free: tuple[Tied, ...]) -> Boar
     change = tangent.shared[:split].reshape(count, -1)
     moves = jnp.concatenate([jnp.zeros((1, 6), change.dtype), tangent.shared[split:].reshape(-1, 6)])
     return BoardState(
-        add_to_cameras(state.cameras, free, change),
+        add_to_camera(state.cameras, free, change.T),
         _move(state.cam_from_rig, moves),
         _move(state.rig_from_board, tangent.boards),
     )
@@ -214,7 +196,7 @@ def _linearized(y: Tangent, start: BoardState, data: BoardData) -> tuple[Any, tu
     points_cam = jax.vmap(lambda pose: jnp.stack(_transform(pose[None], points_rig)))(rig)
 
     def residual(change: Float[Array, "c k"], points: Float[Array, "c 3 v n"]) -> tuple[Array, Array]:
-        moved = add_to_cameras(state.cameras, data.free, change)
+        moved = add_to_camera(state.cameras, data.free, change.T)
         pixels = jax.vmap(lambda camera, p: jnp.stack(camera.project_xyz(p[0], p[1], p[2]), axis=-1))(moved, points)
         return _whitened_errors(pixels, data)
 

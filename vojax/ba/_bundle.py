@@ -18,7 +18,8 @@ from ._bundle_problem import BundleProblem, all_factors
 from ._bundle_residual import residual
 from ._bundle_schur import determined
 from ._bundle_solver import BundleTrace, minimize_bundle
-from ._bundle_state import BundleData, BundleState, add_to_camera, view
+from ._bundle_state import BundleData, BundleState, view
+from ._intrinsics import add_to_camera
 from ._levenberg_marquardt import LMOptions
 from ._losses import Loss, Squared
 from ._whitening import whitening

@@ -11,7 +11,8 @@ from vojax._types import Array
 from vojax.lie import SE3
 
 from ._bundle_factors import PoseFactors
-from ._bundle_state import BundlePriors, Tied, get_attribute
+from ._bundle_state import BundlePriors
+from ._intrinsics import Tied, get_attribute
 
 Gauge = Literal["free", "first_camera", "two_cameras"]
 

@@ -16,7 +16,8 @@ from vojax.lie import SE3
 
 from ._bundle_layout import BundleLayout
 from ._bundle_priors import PriorBlocks, prior_blocks
-from ._bundle_state import BundleData, BundleState, View, add_to_camera, project, view
+from ._bundle_state import BundleData, BundleState, View, project, view
+from ._intrinsics import add_to_camera
 from ._losses import Loss, Squared, robustify
 from ._whitening import whiten
 

@@ -14,7 +14,7 @@ from ._bundle_layout import BundleLayout
 from ._bundle_priors import landmark_root
 from ._bundle_residual import Blocks, linearize, residual
 from ._bundle_state import BundleData, BundleState, retract, zero_like_unknowns
-from ._levenberg_marquardt import LMOptions, NielsenSearch
+from ._levenberg_marquardt import LMOptions, NielsenSearch, UntilConverged
 from ._losses import Loss
 
 
@@ -85,7 +85,7 @@ class _State(eqx.Module):
     num_steps: Int[Array, ""]
 
 
-class BundleLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+class BundleLevenbergMarquardt(UntilConverged):
     """optimistix' iteration with steps on the manifold: a trial point is linearised only once it is accepted."""
 
     rtol: float
@@ -178,28 +178,6 @@ class BundleLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             _State(jnp.array(False), y_eval, step, blocks, search_state, descent_state, trace, state.num_steps + 1),
             None,
         )
-
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: frozenset[object]
-    ) -> tuple[Array, optx.RESULTS]:
-        """End with the first accepted step whose promised gain is below the tolerance."""
-        del fn, y, args, options, tags
-        return state.search_state.converged, optx.RESULTS.successful
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: Any,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        """Nothing to add."""
-        del fn, args, options, state, tags, result
-        return y, aux, {}
 
 
 def _gradient_norm(system: Any, layout: BundleLayout) -> Float[Array, ""]:

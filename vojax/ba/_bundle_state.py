@@ -4,7 +4,6 @@ An observation sees its landmark through a chain of poses: that of the camera, o
 in the rig. Every pose T moves in its own frame, exp(−ξ) @ T with ξ = (ρ, φ).
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,9 +18,7 @@ from vojax.lie import SE3
 
 from ._bundle_factors import PoseFactors
 from ._bundle_layout import BundleLayout
-
-# Names of attributes of the camera that are one unknown: they change by the same increment.
-Tied = tuple[str, ...]
+from ._intrinsics import Tied, add_to_camera, get_attribute
 
 
 class BundleState(eqx.Module):
@@ -72,22 +69,6 @@ class BundleData(eqx.Module):
     basis: Float[Array, "4 3 l"] | None
     free: tuple[Tied, ...] = eqx.field(static=True)
     residual: Callable[..., Array] | None = eqx.field(static=True)
-
-
-def get_attribute(tree: Any, path: str) -> Any:
-    """Attribute by a dotted path; a number is a place in a tuple."""
-    step = lambda node, name: node[int(name)] if name.isdigit() else getattr(node, name)  # noqa: E731
-    return functools.reduce(step, path.split("."), tree)
-
-
-def add_to_camera(camera: Any, free: Sequence[Tied], increments: Sequence[Array]) -> Any:
-    """The camera with each group of tied attributes increased."""
-    for names, increment in zip(free, increments, strict=True):
-        for name in names:
-            camera = eqx.tree_at(
-                lambda tree, name=name: get_attribute(tree, name), camera, get_attribute(camera, name) + increment
-            )
-    return camera
 
 
 Components = tuple[Array, ...]
@@ -205,9 +186,11 @@ def project(camera: Any, point: Sequence[Array], w: Array | None) -> tuple[Array
 def retract(
     state: BundleState, unknowns: Float[Array, " u"], landmarks: Array, data: BundleData, layout: BundleLayout
 ) -> BundleState:
-    """Move a state along a step."""
+    """Move a state along a step; fixed poses stay what they are, to the bit."""
+    moved = (SE3.exp(-layout.expand_poses(unknowns)) @ state.poses).normalize()
+    fixed = jnp.all(layout.pose_columns >= layout.unknowns, axis=-1, keepdims=True)
     return BundleState(
-        (SE3.exp(-layout.expand_poses(unknowns)) @ state.poses).normalize(),
+        SE3(jnp.where(fixed, state.poses.wxyz_xyz, moved.wxyz_xyz)),
         state.intrinsics + layout.expand_groups(unknowns),
         move_landmarks(state.landmarks, landmarks, data),
     )

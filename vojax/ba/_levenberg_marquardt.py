@@ -141,6 +141,32 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         return state.search_state.converged, state.result
 
 
+class UntilConverged(optx.AbstractLeastSquaresSolver):
+    """How the solvers on manifolds, whose states have a `search_state`, come to an end."""
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: frozenset[object]
+    ) -> tuple[Array, optx.RESULTS]:
+        """End with the first accepted step whose promised gain is below the tolerance."""
+        del fn, y, args, options, tags
+        return state.search_state.converged, optx.RESULTS.successful
+
+    def postprocess(
+        self,
+        fn: Any,
+        y: Any,
+        aux: Any,
+        args: Any,
+        options: Any,
+        state: Any,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[Any, Any, dict[str, Any]]:
+        """Nothing to add."""
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
 def minimize(fn: Callable[..., Any], y0: Any, args: Any, descent: optx.AbstractDescent, options: LMOptions) -> Any:
     """Run the solver; never raises, never differentiates through its iterations.
 

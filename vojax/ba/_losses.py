@@ -172,15 +172,18 @@ def robustify(residual: tuple[Array, ...], loss: Loss, weight: Array | None = No
     Returns:
         Components r̃ = r √(w ρ(s)/s), for which ½‖r̃‖² = ½ w ρ(‖r‖²): acceptance tests then see the true cost.
 
-    Differentiability: both modes, including at r = 0, where r̃ ≈ √w r.
+    Differentiability: both modes, including at r = 0, where r̃ ≈ √w r. So far out that derivatives of ρ(s)/s would
+        overflow (10⁶ standard deviations in float32), that ratio counts as constant.
     """
     if isinstance(loss, Squared):
         scaled = None if weight is None else safe_sqrt(weight)
     else:
-        s = sum(component * component for component in residual)
-        small = s < float(jnp.finfo(jnp.result_type(s)).tiny) ** 0.5
-        safe = jnp.where(small, 1.0, s)
-        ratio = jnp.where(small, 1.0, loss.rho(safe) / safe)
+        s = jnp.asarray(sum(component * component for component in residual))
+        limits = jnp.finfo(jnp.result_type(s))
+        small, large = s < float(limits.tiny) ** 0.5, s > float(limits.max) ** 0.3125
+        safe = jnp.where(small | large, 1.0, s)
+        far = jax.lax.stop_gradient(s)
+        ratio = jnp.where(large, loss.rho(far) / far, jnp.where(small, 1.0, loss.rho(safe) / safe))
         scaled = safe_sqrt(ratio if weight is None else weight * ratio)
     return residual if scaled is None else tuple(component * scaled for component in residual)
 

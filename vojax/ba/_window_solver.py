@@ -12,7 +12,7 @@ from jax.custom_batching import custom_vmap
 
 from vojax._types import Array, Bool, Float, Int
 
-from ._levenberg_marquardt import LMOptions, NielsenSearch
+from ._levenberg_marquardt import LMOptions, NielsenSearch, UntilConverged
 from ._losses import Loss
 from ._window_residual import Blocks, WindowData, WindowState, cost, linearize, residuals
 from ._window_schur import SchurDescent
@@ -65,7 +65,7 @@ class _State(eqx.Module):
     initial_cost: Float[Array, ""]
 
 
-class WindowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+class WindowLevenbergMarquardt(UntilConverged):
     """optimistix' iteration with steps on the manifold, and every trial point linearised as it is evaluated.
 
     Rejections are rare, and under `vmap` both ways would be taken anyhow.
@@ -119,28 +119,6 @@ class WindowLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         trial_point = y.moved(tangents, step[1])
         after = _State(jnp.array(False), (tangents, step[1]), trial_point, blocks, search_state, initial_cost)
         return y, after, None
-
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: frozenset[object]
-    ) -> tuple[Array, optx.RESULTS]:
-        """End with the first accepted step whose promised gain is below the tolerance."""
-        del fn, y, args, options, tags
-        return state.search_state.converged, optx.RESULTS.successful
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: Any,
-        aux: Any,
-        args: Any,
-        options: Any,
-        state: Any,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[Any, Any, dict[str, Any]]:
-        """Nothing to add."""
-        del fn, args, options, state, tags, result
-        return y, aux, {}
 
 
 def optimise(start: WindowState, data: WindowData, loss: Loss, options: LMOptions) -> Optimum:

@@ -11,7 +11,8 @@ from jax.core import Tracer
 from vojax._result import Result
 from vojax._types import Array, ArrayLike, Bool, Float, Int
 from vojax.ba import LMOptions, Loss, Squared
-from vojax.ba._board_residual import BoardData, BoardState, get_parameter
+from vojax.ba._board_residual import BoardData, BoardState
+from vojax.ba._intrinsics import get_attribute
 from vojax.cameras import BrownConrady
 from vojax.lie import SE3
 
@@ -65,7 +66,7 @@ class Calibration(eqx.Module):
 
     def values(self) -> Float[Array, " k"]:
         """The free parameters in the order of `names`."""
-        first = [get_parameter(self.camera, name.split(" = ")[0]) for name in self.names]
+        first = [get_attribute(self.camera, name.split(" = ")[0]) for name in self.names]
         return jnp.stack(first) if first else jnp.zeros((0,), self.rms_px.dtype)
 
     def standard_deviations(self) -> Float[Array, " k"]:

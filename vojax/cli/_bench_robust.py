@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vojax
+from vojax import robust
 from vojax._result import Result
 from vojax.cameras import Pinhole, Rig
 from vojax.datasets import simulate_absolute_pose, simulate_relative_pose, simulate_rigid
@@ -91,17 +91,17 @@ def estimators() -> dict[str, Estimator]:
     """All robust estimators."""
     rig = Rig((CAMERA, CAMERA), SIDE_BY_SIDE)
     return {
-        "absolute_pose": Estimator(lambda x, u, key: vojax.estimate_absolute_pose(x, u, CAMERA, key=key), _absolute),
+        "absolute_pose": Estimator(lambda x, u, key: robust.estimate_absolute_pose(x, u, CAMERA, key=key), _absolute),
         "generalized_pose": Estimator(
-            lambda x, u, index, key: vojax.estimate_generalized_pose(x, u, index, rig, key=key), _rig
+            lambda x, u, index, key: robust.estimate_generalized_pose(x, u, index, rig, key=key), _rig
         ),
         "relative_pose": Estimator(
-            lambda u, v, key: vojax.estimate_relative_pose(u, v, CAMERA, CAMERA, key=key), _two_views
+            lambda u, v, key: robust.estimate_relative_pose(u, v, CAMERA, CAMERA, key=key), _two_views
         ),
-        "fundamental": Estimator(lambda u, v, key: vojax.estimate_fundamental(u, v, key=key), _two_views),
-        "homography": Estimator(lambda u, v, key: vojax.estimate_homography(u, v, key=key), _plane),
-        "rigid": Estimator(lambda x, y, key: vojax.estimate_rigid(x, y, key=key), _points),
-        "similarity": Estimator(lambda x, y, key: vojax.estimate_similarity(x, y, key=key), _points),
+        "fundamental": Estimator(lambda u, v, key: robust.estimate_fundamental(u, v, key=key), _two_views),
+        "homography": Estimator(lambda u, v, key: robust.estimate_homography(u, v, key=key), _plane),
+        "rigid": Estimator(lambda x, y, key: robust.estimate_rigid(x, y, key=key), _points),
+        "similarity": Estimator(lambda x, y, key: robust.estimate_similarity(x, y, key=key), _points),
     }
 
 

@@ -251,9 +251,9 @@ def _report(found: Any, views: _Views, mask: Any, command: Calibrate, seconds: f
 
 
 def _number(camera: Any, name: str) -> float:
-    from vojax.ba._board_residual import get_parameter
+    from vojax.ba._intrinsics import get_attribute
 
-    return float(get_parameter(camera, name))
+    return float(get_attribute(camera, name))
 
 
 def _coverage(corners: Any, image_size: tuple[int, int]) -> float:

@@ -70,6 +70,7 @@ def score_hypotheses(
         ValueError: If the function is no estimator or shapes do not fit.
 
     Example:
+        >>> import jax
         >>> import vojax
         >>> from vojax.robust import InlierCount
         >>> points = jax.random.normal(jax.random.key(0), (50, 3))

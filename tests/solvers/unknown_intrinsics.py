@@ -1,4 +1,4 @@
-"""Problems of a camera with unknown focal length and radial distortion."""
+"""Problems of cameras with unknown focal length and radial distortion, and how they are spoiled."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,9 +46,6 @@ def spoiled(points, pixels, kind):
         points[:] = points[:, :1]
     elif kind == "one pixel":
         pixels[:] = pixels[:, :1]
-    elif kind == "no focus":
-        pixels[:, 1] = pixels[:, 0]
-        pixels[:, 2] = pixels[:, 0]
     elif kind == "collinear":
         points[:] = points[:, :1] + (points[:, 1:2] - points[:, :1]) * np.arange(float(points.shape[1]))[:, None]
     elif kind == "zeros":
@@ -68,10 +65,10 @@ def spoiled(points, pixels, kind):
     return points, pixels
 
 
-def mixed(seed, count, **kind):
-    """Random problems, half of them degenerate in one of several ways or absurd."""
-    points, pixels, *_ = problems(count, seed, **kind)
+def mixed(points, pixels):
+    """The problems with half of them degenerate in one of several ways or absurd."""
+    points, pixels = points.copy(), pixels.copy()
     kinds = [*DEGENERATE, "two points", "three on a line", "huge", "tiny"]
-    for part, name in zip(np.array_split(np.arange(count // 2), len(kinds)), kinds, strict=True):
-        points[part], pixels[part] = spoiled(points[part], pixels[part], name)
+    for part, kind in zip(np.array_split(np.arange(len(points) // 2), len(kinds)), kinds, strict=True):
+        points[part], pixels[part] = spoiled(points[part], pixels[part], kind)
     return points, pixels
