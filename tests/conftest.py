@@ -11,6 +11,16 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 TOLERANCE = {jnp.float32: 2e-5, jnp.float64: 1e-10, "float32": 2e-5, "float64": 1e-10}
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Compile quickly, as compilation is most of the tests' time, except where the test says that many lanes run.
+
+    Slow tests, doctests, notebooks and the command line run what users run.
+    """
+    users = not isinstance(item, pytest.Function) or any(map(item.get_closest_marker, ("slow", "optimized")))
+    jax.config.update("jax_disable_most_optimizations", not users)
+
+
 @pytest.fixture
 def x64():
     """Double precision inside the test, and only there."""

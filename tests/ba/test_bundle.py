@@ -330,6 +330,7 @@ def test_what_is_fixed_does_not_move_and_float32_agrees(scene, shared):
     assert float(double.cost) * (1 - 1e-3) < float(found.cost) < 1.3 * float(double.cost)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 47, 200])
 def test_cholesky_by_panels(size, x64):
     rng = np.random.default_rng(size)

@@ -118,6 +118,7 @@ def calibration(scene, trials):
     return problem.layout.unknowns, *jax.jit(lambda noise: jax.lax.map(one, noise, batch_size=25))(jnp.asarray(noise))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trials", [50, pytest.param(1000, marks=pytest.mark.slow)])
 def test_errors_are_as_large_as_covariances_say(trials, scene, x64):
     dimension, poses, landmark, regular = calibration(scene, trials)

@@ -50,6 +50,7 @@ def test_structure_only_is_triangulation(scene, x64):
         np.testing.assert_allclose(covariance.landmark(j), expected.covariance, atol=1e-6 * scale)
 
 
+@pytest.mark.slow
 def test_motion_only_is_pose_refinement(scene, x64):
     poses, points, pixels, frame, seen = scene
     moved = SE3.exp(0.02 * jnp.asarray(np.random.default_rng(1).normal(size=(C, 6)))) @ poses

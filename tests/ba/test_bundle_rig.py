@@ -119,6 +119,7 @@ def test_a_rig_step_is_the_dense_step(scene, x64):
     check_blocks(scene.problem(free_intrinsics=[("fx", "fy")], factors=[motion]))
 
 
+@pytest.mark.slow
 def test_a_rig_is_calibrated_while_it_moves(scene, x64):
     start = spread(scene.cam_from_rig, 0.01, 1)
     start = SE3(jnp.where((jnp.arange(R) == 1)[:, None], scene.cam_from_rig.wxyz_xyz, start.wxyz_xyz))
@@ -147,6 +148,7 @@ def test_a_rig_is_calibrated_while_it_moves(scene, x64):
     assert max(nees) < 22.5  # 99.9 % of χ² with six degrees of freedom
 
 
+@pytest.mark.slow
 def test_a_rig_of_one_camera_is_that_camera(scene, x64):
     only = scene.mount == 1
     problem = scene.problem(mask=only, camera=scene.camera(450.0))
@@ -216,6 +218,7 @@ def stereo():
         return cam_from_world, landmarks, np.asarray(exact) + noise, frame, seen, camera, root @ root.swapaxes(1, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("homogeneous", [False, True])
 def test_a_stereo_step_is_the_dense_step(homogeneous, stereo, x64):
     cam_from_world, landmarks, pixels, frame, seen, camera, sigma = stereo

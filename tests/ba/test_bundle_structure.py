@@ -128,6 +128,7 @@ def test_near_landmarks_are_where_euclidean_ones_are(far, x64):
         )
 
 
+@pytest.mark.slow
 def test_anchored_landmarks_keep_depth_one_in_their_anchors(far, x64):
     poses, points, pixels, frame, seen = far
     anchors = np.arange(16) % 4
@@ -220,6 +221,7 @@ def adjust_house(house, sigma, angle, seed=3):
     return problem, adjust(problem)
 
 
+@pytest.mark.slow
 def test_points_keep_to_planes_and_lines_at_right_angles(house, x64):
     _, points, *_ = house
     problem, found = adjust_house(house, 1e-4, 1e-5)
@@ -338,6 +340,7 @@ def test_circular_motion_steadies_a_drive(x64):
     assert np.sqrt(np.mean(with_model**2)) < 0.6 * np.sqrt(np.mean(without**2))
 
 
+@pytest.mark.slow
 def test_three_views_tie_two_baselines(x64):
     rng = np.random.default_rng(6)
     poses = drive(3, rng)

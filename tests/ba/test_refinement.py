@@ -260,6 +260,7 @@ def test_the_covariance_is_the_inverse_gauss_newton_matrix(name, d, x64):
         )
 
 
+@pytest.mark.slow
 def test_errors_follow_the_covariance(x64):
     # 1,024 problems with anisotropic noise; NEES is χ² with six degrees of freedom. Band: 99.9 %, seeds fixed.
     nees = []
@@ -395,6 +396,7 @@ def float32_batch():
     return problems, solve(arguments(problems, np.float32), Squared())
 
 
+@pytest.mark.slow
 def test_nothing_is_ever_not_a_number(float32_batch):
     _, found = float32_batch
     for leaf in jax.tree.leaves((found.model, found.covariance, found.cost)):

@@ -194,6 +194,7 @@ def test_without_noise_the_truth_comes_back(x64):
     np.testing.assert_allclose(np.asarray(found.points_world)[seen], np.asarray(truth.landmarks_world)[seen], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_errors_follow_the_covariance(x64):
     # The last keyframe's NEES over 320 windows, against the 99.9 % band of χ² with six degrees of freedom; seeds fixed.
     # Half a pixel, so that linearisation at a few metres of depth does not show.
@@ -221,6 +222,7 @@ def single():
     return windows, truth, adjust(windows, Huber())
 
 
+@pytest.mark.slow
 def test_float32_converges(single):
     _, truth, found = single
     assert np.all(found.result == Result.success)

@@ -112,6 +112,7 @@ def slid():
         return results
 
 
+@pytest.mark.slow
 def test_the_last_window_is_that_of_the_whole_drive(slid):
     # What differs is of second order, linearisation at the estimates of then, and falls with the square of the noise.
     error, apart, *_ = slid[1.0]
@@ -170,6 +171,7 @@ def test_rows_equal_the_schur_complement_of_dense_normal_equations(x64):
     assert np.all(np.asarray(prior.factor)[:, -1] == 0)
 
 
+@pytest.mark.slow
 def test_without_measurements_the_prior_is_empty(dtype):
     window = SE3(jnp.tile(jnp.array([[1.0, 0, 0, 0, 0, 0, 0]], dtype), (C, 1)))
     prior = marginalize_oldest(

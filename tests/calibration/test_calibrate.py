@@ -131,6 +131,7 @@ def test_gradients_of_a_calibration(views, board, x64):
     assert float(forward) == pytest.approx(float(jnp.sum(gradient * direction)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_wrong_corners_lose_to_a_robust_loss(lens, views, board, x64):
     corners = np.array(views[0])
     rng = np.random.default_rng(11)
@@ -146,6 +147,7 @@ def test_wrong_corners_lose_to_a_robust_loss(lens, views, board, x64):
     assert flagged == set(wrong)
 
 
+@pytest.mark.slow
 def test_start_and_free_parameters(views, board, x64):
     start = Pinhole(fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     tied = calibrate(views[0], board, SIZE, model=start, free=(("fx", "fy"),), sigma_px=2.0)

@@ -104,6 +104,7 @@ def test_lines_meet_in_their_vanishing_point(x64):
     assert not bool(valid)
 
 
+@pytest.mark.slow
 def test_a_shared_focal_length_from_two_images_with_wrong_matches(x64):
     rng = np.random.default_rng(4)
     camera = Pinhole(fx=600.0, fy=600.0, cx=320.0, cy=240.0)

@@ -35,6 +35,7 @@ def pair(views, board):
         return corners + 0.2 * noise, cameras, right_from_left
 
 
+@pytest.mark.slow
 def test_the_truth_is_within_its_deviations(pair, board, x64):
     corners, cameras, right_from_left = pair
     mask = np.ones(corners.shape[:3], bool)

@@ -313,6 +313,7 @@ def first_and_second(camera, points, step):
     return jax.vmap(jax.jacfwd(jax.jacfwd(camera.project)))(points), jnp.stack(numeric, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["kannala_brandt", "scaramuzza", "unified_lens"])
 def test_second_derivatives_match_differences_of_the_first(name, x64):
     points = bearings_within(0.9 * MODELS[name][2])[[0, 35, 160]] * 1.5

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-import vojax.odometry
 from vojax.cli import main
-from vojax.odometry import FrameEstimate
+from vojax.odometry import PIPELINES, FrameEstimate
 
 FRAMES = 6
 ROW = "20 0 16 {} 0 20 8 0 0 0 1 0"
@@ -105,7 +104,7 @@ class FakeOdometry:
         pose[:3, 3] = [0.02 * k, 0.0, 1.01 * k]
         points = np.array([[3.0, 4.0], [20.0, 9.0]], np.float32)
         inliers = 0 if k in self.bridged or k == 0 else 100 + k
-        return FrameEstimate(pose, inliers, k in self.bridged, k % 2 == 0, points, points - 1.0, np.ones(2, np.float32))
+        return FrameEstimate(pose, inliers, k in self.bridged, k % 2 == 0, points, points - 1.0)
 
 
 @pytest.fixture
@@ -120,7 +119,7 @@ def fake(request, monkeypatch):
     class Fake(FakeOdometry):
         made: ClassVar[list] = []
 
-    monkeypatch.setitem(vojax.odometry.PIPELINES, "stereo-3d2d", Fake)
+    monkeypatch.setitem(PIPELINES, "stereo-3d2d", PIPELINES["stereo-3d2d"]._replace(odometry=Fake))
     if "drawn_for_real" not in request.fixturenames:
         monkeypatch.setattr("vojax.cli._run.plot_trajectory", lambda estimate, truth, **_: f"{len(estimate)} poses")
         monkeypatch.setattr("vojax.cli._run.save_figure", lambda figure, path: path.write_text(figure))

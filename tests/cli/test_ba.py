@@ -76,6 +76,7 @@ def test_a_bal_file_is_refined(vojax_command, scene, tmp_path):
         assert word in outcome.stdout
 
 
+@pytest.mark.slow
 def test_a_colmap_model_is_refined(vojax_command, scene, tmp_path):
     write_colmap(tmp_path / "sparse", as_colmap(scene))
     outcome = vojax_command(

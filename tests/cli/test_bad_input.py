@@ -1,5 +1,6 @@
 """Everything a user can get wrong: one line, exit status 2, nothing lost."""
 
+import dataclasses
 import io
 import json
 import sys
@@ -191,7 +192,7 @@ def test_a_pose_that_is_not_finite_is_never_written(run_kitti, fake, tmp_path, m
     def step(self, left, right):
         estimate = good(self, left, right)
         pose = estimate.world_from_cam * (np.nan if len(self.images) == 5 else 1.0)
-        return estimate._replace(world_from_cam=pose)
+        return dataclasses.replace(estimate, world_from_cam=pose)
 
     monkeypatch.setattr(fake, "step", step)
     error = run_kitti().error

@@ -197,3 +197,25 @@ def test_a_moving_car_hides_what_stands_still(sequence):
 def test_bad_arguments_are_named(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         SyntheticStereoSequence(**bad)
+
+
+def test_a_lap_closes_and_bends_fast():
+    sequence = SyntheticStereoSequence(frames=1001, lap=True)
+    position, rotation = sequence.poses[:, :, 3], sequence.poses[:, :, :3]
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    assert 400.0 < steps[:500].sum() < 500.0
+    # Back to within the sway of the car, in both laps.
+    assert np.linalg.norm(position[[500, 1000]], axis=1).max() < 0.3
+    turns = np.einsum("kij,kil->kjl", rotation[:-1], rotation[1:])
+    angles = np.degrees(np.arccos((np.trace(turns, axis1=1, axis2=2) - 1) / 2))
+    assert 4.0 < angles.max() < 6.0
+
+
+def test_an_open_shutter_blurs_along_the_motion():
+    sharp = SyntheticStereoSequence(frames=26, noise_gray=0.0)
+    blurred = SyntheticStereoSequence(frames=26, noise_gray=0.0, shutter=0.5)
+    # Frame 25 is in the bend: the picture moves sideways.
+    one, other = (s.images(25)[0].astype(float) for s in (sharp, blurred))
+    assert np.abs(np.diff(other, axis=1)).mean() < 0.7 * np.abs(np.diff(one, axis=1)).mean()
+    assert abs(other.mean() - one.mean()) < 3.0
+    np.testing.assert_array_equal(sharp.poses, blurred.poses)

@@ -168,6 +168,7 @@ def test_votes_agree_with_opencv(x64):
         assert abs(float(votes) - count) <= 3
 
 
+@pytest.mark.slow
 def test_votes_beyond_180_degrees(dtype):
     # Points all around the cameras: half of them have z < 0.
     rng = np.random.default_rng(7)
@@ -262,6 +263,7 @@ def test_gradients_equal_central_differences(x64):
         np.testing.assert_allclose(forward(essential), reverse(essential), rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(dtype):
     *_, rotation, translation = relative_pose_problems(64, 1, seed=12)
     essential = essential_matrices(rotation, translation)
@@ -277,6 +279,7 @@ def test_gradients_are_finite_everywhere(dtype):
     assert np.isfinite(motions(essential, dtype)[0]).all()
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop(x64):
     rays0, rays1, rotation, translation = relative_pose_problems(6, 5, seed=13)
     essential = essential_matrices(rotation, translation)

@@ -205,6 +205,7 @@ def test_gradients_equal_central_differences(x64):
     np.testing.assert_allclose(reverse / size, forward / size, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(dtype):
     rotation, _, normal, homography, _ = motions(seed=10)
     homography[:50] = rotation[:50]

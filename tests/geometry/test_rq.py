@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
@@ -82,6 +83,7 @@ def degenerate():
     return matrices
 
 
+@pytest.mark.slow
 def test_degenerate_matrices(dtype):
     projection = degenerate().astype(dtype)
     calibration, pose = take_apart(projection)
@@ -121,6 +123,7 @@ def test_gradients_equal_central_differences(x64):
         np.testing.assert_allclose(ahead, back, rtol=1e-10, atol=1e-10 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere(dtype):
     def total(projection):
         calibration, pose = camera_from_projection(projection)

@@ -104,6 +104,7 @@ def test_float32_rays_keep_the_depth_of_far_points():
     assert np.linalg.norm(found - point) < 0.01 * np.linalg.norm(point)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", [[0, 0, 1.0], [0.6, 0.0, -0.8], [1.0, 0, 0]])
 def test_parallel_rays_meet_far_away_in_their_direction(direction, dtype):
     bearings = jnp.tile(jnp.asarray(direction, dtype)[None, :], (4, 1))
@@ -132,6 +133,7 @@ def test_degenerate_rays_are_finite():
     np.testing.assert_allclose(point, [1.0, 2.0, 3.0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_of_nearest_point_matches_central_differences(x64):
     bearings = rays_to([[0.3, 0.2, 4.0]], CENTERS)[0]
     check_jacobian(lambda x: triangulate_rays(x[:4], x[4:]), jnp.concatenate([jnp.asarray(CENTERS), bearings]))
@@ -171,6 +173,7 @@ def test_null_vector_agrees_with_numpy_svd(rows, dtype):
     assert error.max() < {jnp.float32: 1e-4, jnp.float64: 1e-12}[dtype]
 
 
+@pytest.mark.slow
 def test_null_vector_derivative_matches_central_differences_and_survives_repeated_values(x64):
     matrix = jnp.asarray(np.random.default_rng(5).normal(size=(6, 4)))
     check_jacobian(null_vector, matrix)
@@ -327,6 +330,7 @@ def test_refined_covariance_covers_monte_carlo_errors():
     assert bool(found.valid.all())
 
 
+@pytest.mark.slow
 def test_masked_views_do_not_count_and_cameras_may_differ_per_view(x64):
     cameras = [
         Pinhole(*CAMERA),
@@ -410,6 +414,7 @@ def test_degenerate_refinements_are_finite_and_not_valid():
     assert bool(good.valid)
 
 
+@pytest.mark.slow
 def test_uncertain_points_and_small_angles_are_flagged():
     camera = Pinhole(*CAMERA)
     views = poses(jnp.float32, views=2)

@@ -119,6 +119,7 @@ def test_adjoint_moves_tangents_across(group, dtype):
     np.testing.assert_allclose(left, right, rtol=0, atol=3e-5 if dtype is jnp.float32 else 1e-12)
 
 
+@pytest.mark.slow
 def test_jacobians_against_central_differences(group, x64, tangents):
     xi, step = tangents(group, jnp.float64), 1e-6
     T = run(group.exp, xi)
@@ -134,6 +135,7 @@ def test_jacobians_against_central_differences(group, x64, tangents):
     np.testing.assert_allclose(run(group.jacobian_right, xi), np.stack(right, axis=-1), rtol=0, atol=5e-9)
 
 
+@pytest.mark.slow
 def test_jacobian_inverses(group, dtype, tangents, values):
     xi = tangents(group, dtype)
     eye = np.broadcast_to(np.eye(group.tangent_dim), (len(xi), group.tangent_dim, group.tangent_dim))
@@ -145,6 +147,7 @@ def test_jacobian_inverses(group, dtype, tangents, values):
         np.testing.assert_allclose(product, eye, rtol=0, atol=3e-5 if dtype is jnp.float32 else 1e-12)
 
 
+@pytest.mark.slow
 def test_leading_axes_broadcast(group, values):
     T = group.sample_uniform(jax.random.key(6), (4, 1))
     S = group.sample_uniform(jax.random.key(7), (5,))

@@ -19,6 +19,7 @@ def test_interpolate_ends_and_middle(group, dtype):
     np.testing.assert_allclose(first, second, rtol=0, atol=10 * tolerance)
 
 
+@pytest.mark.slow
 def test_interpolate_moves_at_constant_speed(group, x64):
     T0, T1 = (group.sample_uniform(jax.random.key(seed)) for seed in (2, 3))
     alphas = jnp.linspace(-0.2, 1.2, 15)
@@ -36,6 +37,7 @@ def test_interpolate_takes_the_shorter_way():
     np.testing.assert_allclose(middle.log(), [0.0, 0.0, -0.25 * np.pi], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_equal_ends_and_half_turns(group):
     T = group.sample_uniform(jax.random.key(4))
     half = T @ group.exp(jnp.zeros(group.tangent_dim).at[-2 if group.tangent_dim == 7 else -1].set(jnp.pi))
@@ -77,6 +79,7 @@ def test_concatenation_equals_the_sequential_product(group, dtype, n):
             np.testing.assert_allclose(whole.as_matrix() / size, expected / size, rtol=0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_several_trajectories_at_once(group):
     increments = group.exp(0.2 * jax.random.normal(jax.random.key(7), (5, 3, group.tangent_dim)))
     chain = jax.jit(cumulative_compose)
@@ -86,6 +89,7 @@ def test_several_trajectories_at_once(group):
         np.testing.assert_allclose(poses.parameters()[:, j], alone.parameters(), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_long_float32_chains_stay_rotations():
     # A closed circle of 3,600 steps of a tenth of a degree: back at the origin, on the unit sphere of quaternions.
     step = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 2 * np.pi / 3600], np.float32)
@@ -96,6 +100,7 @@ def test_long_float32_chains_stay_rotations():
     np.testing.assert_allclose(poses.translation()[1799], [0.0, 2 * radius, 0.0], atol=36 * 1e-4)
 
 
+@pytest.mark.slow
 def test_concatenation_is_differentiable():
     def end(step):
         return cumulative_compose(SE3.exp(jnp.tile(step[None], (5, 1)))).translation()[-1]

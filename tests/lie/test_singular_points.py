@@ -56,6 +56,7 @@ LONG_TO_COMPILE = [SO3, pytest.param(SE3, marks=pytest.mark.slow), pytest.param(
 LONG_TO_COMPILE_IDS = ["SO3", "SE3", "Sim3"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", LONG_TO_COMPILE, ids=LONG_TO_COMPILE_IDS)
 @pytest.mark.parametrize("mode", ["value", "forward", "reverse"])
 def test_finite_in_float32(group, mode):
@@ -98,6 +99,7 @@ def test_log_undoes_exp_with_unit_slope(group):
     np.testing.assert_allclose(slope, np.broadcast_to(np.eye(group.tangent_dim), slope.shape), rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [SO3, SE3])
 def test_second_derivatives_at_identity(group):
     def squared_distance(x):

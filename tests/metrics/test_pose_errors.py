@@ -101,6 +101,7 @@ def test_rotation_gradients(function, x64):
     np.testing.assert_allclose(gradient, numeric, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", [geodesic_error, axis_error])
 @pytest.mark.parametrize("rotvec", [[0.0, 0.0, 0.0], [np.pi, 0.0, 0.0], [np.pi / 2, 0.0, 0.0]])
 def test_rotation_gradients_are_finite_at_singular_points(function, rotvec):

@@ -23,6 +23,8 @@ from vojax.odometry import (
 )
 from vojax.odometry._motion import StereoFeatures, stereo_motion
 
+pytestmark = pytest.mark.optimized
+
 STEREO = RectifiedStereo(Pinhole(fx=700.0, fy=700.0, cx=600.0, cy=180.0), baseline=0.54)
 SIZE = 640
 
@@ -60,6 +62,7 @@ def estimate(seed, first, second, calibration=None, options=MotionOptions()):
     return stereo_motion(first, second, jnp.ones(SIZE), SE3.identity(), calibration, STEREO, key, options)
 
 
+@pytest.mark.slow
 def test_motion_is_found_among_outliers_with_a_covariance_that_fits():
     nees = []
     for seed in range(12):
@@ -77,6 +80,7 @@ def test_motion_is_found_among_outliers_with_a_covariance_that_fits():
     assert 3.0 < np.mean(nees) < 12.0
 
 
+@pytest.mark.slow
 def test_disparity_error_is_calibrated_away_and_without_it_scale_is_wrong():
     truth_offsets = np.array([0.1, 1.0])
     calibration, plain_scale, calibrated_scale = DisparityCalibration.prior(), [], []
@@ -112,7 +116,7 @@ def test_keyframe_rule():
 
 
 def drive(sequence, options=StereoOdometryOptions(), blank=()):
-    odometry = PIPELINES["stereo-3d2d"](sequence.stereo, options)
+    odometry = PIPELINES["stereo-3d2d"].odometry(sequence.stereo, options)
     estimates = []
     for k in range(len(sequence)):
         left, right = sequence.images(k)

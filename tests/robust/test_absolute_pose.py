@@ -12,6 +12,8 @@ from vojax.datasets import simulate_absolute_pose
 from vojax.metrics import nees
 from vojax.robust import RansacOptions, estimate_absolute_pose
 
+pytestmark = pytest.mark.optimized
+
 B, N = 200, 100  # one program serves nearly every test: it solves B problems of N correspondences
 CAMERA = {"fx": 800.0, "fy": 800.0, "cx": 639.5, "cy": 479.5}
 THRESHOLD = 3.0
@@ -137,6 +139,7 @@ def test_rows_that_are_not_numbers_count_as_masked(half_wrong):
         assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_errors_follow_the_covariance():
     # A threshold of five deviations cuts no tail off, so NEES is χ² with six degrees of freedom: 99.9 % band of the
     # mean over 600 problems; seeds fixed.

@@ -11,6 +11,8 @@ from vojax import Result
 from vojax.metrics import nees
 from vojax.robust import RansacOptions, estimate_rigid, estimate_similarity
 
+pytestmark = pytest.mark.optimized
+
 B, N = 100, 60
 THRESHOLD, SIGMA = 0.1, 0.02
 
@@ -103,6 +105,7 @@ def test_bad_input_has_a_code_and_an_empty_answer(estimator):
         assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_real_points_with_nine_percent_inliers(data_root):
     rows = np.loadtxt(data_root / "rigid3d" / "rigid_pose_example_points.txt")

@@ -77,6 +77,7 @@ def test_recalls_the_pose_among_wrong_pixels():
     assert inliers[:, ~right].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
     values = []
     for seed in range(5):
@@ -88,6 +89,7 @@ def test_the_covariance_is_that_of_the_errors():
     assert low < values.mean() < high
 
 
+@pytest.mark.slow
 def test_a_rig_of_one_camera_is_a_camera():
     camera = rig().cameras[1]
     rng = np.random.default_rng(2)

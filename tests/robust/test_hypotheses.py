@@ -161,6 +161,7 @@ def test_what_is_impossible_or_not_finite_is_infinitely_wrong():
     assert np.isfinite(scores).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", [Msac(8.0), GaussianUniformScore(4.0)])
 def test_derivatives_equal_central_differences(score, x64):
     points, _, pixels1, poses = numbers()

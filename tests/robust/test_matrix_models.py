@@ -11,6 +11,8 @@ from vojax.ba import homography_basis
 from vojax.datasets import simulate_relative_pose
 from vojax.robust import RansacOptions, estimate_fundamental, estimate_homography
 
+pytestmark = pytest.mark.optimized
+
 B, N = 100, 120
 SIZE = np.array([1280.0, 960.0])
 
@@ -56,6 +58,7 @@ def corner_errors(matrices, truth):
     return np.linalg.norm(transfer(matrices, corners) - transfer(truth, corners), axis=-1).mean(axis=1)
 
 
+@pytest.mark.slow
 def test_homography_is_more_accurate_than_poselib():
     import poselib
 

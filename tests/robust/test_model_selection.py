@@ -69,6 +69,7 @@ def degrees(cosines):
     return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
 
 
+@pytest.mark.slow
 def test_scenes_planes_and_turns_are_told_apart(mixed):
     found, _, _ = mixed
     assert right(found, MIXED).mean() >= 0.95

@@ -69,6 +69,7 @@ def test_degrees_of_freedom_of_the_fit_are_given_back():
     assert abs(np.sqrt(np.mean(np.asarray(found.sigma) ** 2)) - 1.0) < 0.04  # √(1 − 8/60) is 0.93
 
 
+@pytest.mark.slow
 def test_derivative_equals_central_differences(x64):
     errors = draw(2, 0.4)[0]
     number = jax.jit(lambda e: noise_scale(jnp.sum(e * e, axis=1), dimension=2).sigma)
@@ -83,6 +84,7 @@ def test_derivative_equals_central_differences(x64):
     np.testing.assert_allclose(forward, np.sum(gradient * direction), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_nothing_is_ever_not_a_number():
     rng = np.random.default_rng(3)
     for squares in (

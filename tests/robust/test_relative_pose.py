@@ -13,6 +13,8 @@ from vojax.datasets import simulate_relative_pose
 from vojax.metrics import nees
 from vojax.robust import RansacOptions, estimate_relative_pose
 
+pytestmark = pytest.mark.optimized
+
 B, N = 100, 120
 CAMERA = {"fx": 800.0, "fy": 800.0, "cx": 639.5, "cy": 479.5}
 
@@ -114,6 +116,7 @@ def tangent_errors(model, truth):
     return jnp.concatenate([tau, -turn.log()])
 
 
+@pytest.mark.slow
 def test_errors_follow_the_covariance():
     values = []
     for seed in range(4):

@@ -45,6 +45,7 @@ def misclassified(labels, truth):
     return min(np.mean(labels != names) for names in renamed)
 
 
+@pytest.mark.slow
 def test_two_bodies_have_two_motions():
     for seed in range(10):
         points0, points1, labels, motions = moving_bodies(seed)
@@ -72,6 +73,7 @@ def test_one_body_and_none():
     assert found.num_models == 0
 
 
+@pytest.mark.slow
 def test_masked_observations_have_no_label_and_batches_are_loops():
     problems = [moving_bodies(seed) for seed in range(3)]
     masks = jnp.asarray(np.random.default_rng(0).uniform(size=(3, N)) < 0.8)

@@ -156,6 +156,7 @@ def tiny_problem():
     return subsets, losses, scores, valid, jnp.asarray(rng.normal(size=5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("select", SELECTIONS)
 @pytest.mark.parametrize("k", [1, 3])
 def test_score_function_gradient_is_exact_in_expectation(select, k, x64):
@@ -190,6 +191,7 @@ def test_score_function_gradient_is_exact_in_expectation(select, k, x64):
         assert probability @ jnp.sum(gradients**2, axis=1) < 0.5 * (probability @ jnp.sum(plain**2, axis=1))
 
 
+@pytest.mark.slow
 def test_drawn_gradients_average_to_the_exact_one(x64):
     """As above with what is drawn: sampling, probability and baseline fit together."""
     truth = simulate_rigid(jax.random.key(0), 5, outlier_fraction=0.2, sigma=0.1, dtype=jnp.float64)
@@ -325,6 +327,7 @@ def soft_loss(kind, logits, *observations, key, k=16, mask=None, select=None, fa
     return loss, found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [plane, *SLOW, pytest.param(rigid, marks=pytest.mark.slow)])
 def test_gradient_goes_through_solvers_and_scores(kind, x64):
     kind = kind(1, 12, jnp.float64)
@@ -365,6 +368,7 @@ def test_gradient_moves_weight_from_outliers_to_inliers(kind):
     assert gain.mean() > 5.0 * gain.std() / 128**0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [plane, rigid, *SLOW])
 def test_degenerate_observations_give_the_failure_loss_and_no_nan(kind):
     n = 12
@@ -418,6 +422,7 @@ def test_not_finite_losses_and_scores_are_no_hypotheses():
     assert gradients[2][2] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "select", [sparsemax_weights, *(pytest.param(f, marks=pytest.mark.slow) for f in (softmax_weights, argmax_weights))]
 )

@@ -124,6 +124,7 @@ def test_gradient_equals_central_differences(m, x64):
     assert abs(np.sum(gradient)) < 1e-12  # a constant changes nothing
 
 
+@pytest.mark.slow
 def test_float32_is_good_for_confident_logits():
     # Weights that span 34 decades: naively, 1 − Σ w of what was drawn before is rounding.
     logits = np.linspace(-60.0, 20.0, 16)
@@ -136,6 +137,7 @@ def test_float32_is_good_for_confident_logits():
         assert np.isfinite(_jacobian(x, samples)).all()
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop():
     logits = jnp.asarray(np.random.default_rng(0).normal(size=(4, 12)), jnp.float32)
     keys = jax.random.split(jax.random.key(1), 4)

@@ -206,6 +206,7 @@ def test_nothing_but_numbers_comes_out_of_a_million(family, dtype):
         assert np.isfinite(solve(family, *mixed(seed + 20, 125_000, N, dim=2), dtype=dtype).models).all()
 
 
+@pytest.mark.slow
 @each_family
 def test_gradients_equal_central_differences(family, x64):
     def total(points0, points1, weights, root):

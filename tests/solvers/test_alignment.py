@@ -185,6 +185,7 @@ def test_gradients_equal_central_differences(solver, x64):
             np.testing.assert_allclose(forward(*data), gradient @ flat, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @SOLVERS
 def test_gradients_are_finite_at_degenerate_sets(solver):
     points0, points1, weights, *_ = problems(count=64, n=4, seed=5)

@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from tests.solvers.problems import central_differences, lanes, pose_errors, solve_in_batches
 from vojax.solvers import dlt_pnp, dlt_pnp_calibrated
 
+pytestmark = pytest.mark.optimized
+
 METHODS = ("svd", "fix_p23", "cross")
 N = 8
 
@@ -151,6 +153,7 @@ def reference(points, images, weights, method):
     return np.linalg.inv(t) @ p.reshape(3, 4) @ u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", SOLVE)
 def test_equals_the_reference_with_noise(x64, method):
     data, _ = problems(2048, seed=3, sigma_px=1.0)
@@ -325,6 +328,7 @@ def test_gradients_are_finite_everywhere(method):
         assert np.isfinite(part).all()
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     data, _ = problems(2048, seed=14)
     batch = solve(data, "svd", np.float64)

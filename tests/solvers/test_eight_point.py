@@ -105,6 +105,7 @@ def test_fundamental_matrix_is_that_of_opencv(x64):
         np.testing.assert_allclose(calibrated(candidates.models[i]), calibrated(unit_matrices(theirs))[None], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [8, 20])
 def test_essential_matrix_is_that_of_numpy(n, x64):
     rng = np.random.default_rng(5)
@@ -254,6 +255,7 @@ def test_gradients_equal_central_differences(kind, n, x64):
             np.testing.assert_allclose(ahead, back, rtol=1e-8, atol=1e-8 * size + 1e-11)
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     rays0, rays1, _ = bearing_problems(4, 8, seed=12)
     last = solve_in_batches(essential_last, rays0, rays1, dtype=np.float64, size=SIZE)
@@ -263,6 +265,7 @@ def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
         np.testing.assert_allclose(eight_point(rays0[i], rays1[i]).models, last.models[i], atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["essential", "fundamental"])
 def test_many_lanes_give_what_few_give(kind):
     many, _ = errors_of(kind, 8, 65_536, np.float32, seed=13, size=65_536)
@@ -298,6 +301,7 @@ def test_projection_is_that_of_the_svd(dtype):
     assert error.max() < (1e-5 if dtype == jnp.float32 else 1e-13)
 
 
+@pytest.mark.slow
 def test_projection_of_impossible_matrices_is_zero(dtype):
     project = jax.jit(project_to_essential)
     gradient = jax.jit(jax.grad(lambda m: jnp.sum(project_to_essential(m))))
@@ -311,6 +315,7 @@ def test_projection_of_impossible_matrices_is_zero(dtype):
         assert np.isfinite(gradient(good * dtype(size))).all()
 
 
+@pytest.mark.slow
 def test_projection_gradients(x64):
     def function(matrix):
         return jnp.sum(project_to_essential(matrix) * jnp.arange(1.0, 10.0).reshape(3, 3))

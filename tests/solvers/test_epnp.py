@@ -13,6 +13,8 @@ from vojax.lie import SO3
 from vojax.solvers import epnp
 from vojax.solvers._epnp import _step
 
+pytestmark = pytest.mark.optimized
+
 N = 30
 solve_last = jax.jit(jax.vmap(epnp, in_axes=-1, out_axes=-1))
 KINDS = ["collinear", "one point", "three weights", "negative weight", "zero ray", "one ray", "nan", "inf"]
@@ -210,6 +212,7 @@ def test_steps_are_those_of_automatic_derivatives(x64):
         np.testing.assert_allclose(2.0 * relative.wxyz[1:] / relative.wxyz[0], expected[3:], atol=1e-11)
 
 
+@pytest.mark.slow
 def test_without_refinement(x64):
     plain = jax.jit(jax.vmap(functools.partial(epnp, gauss_newton_steps=0), in_axes=-1, out_axes=-1))
     data, _, rotation, translation = problems(2048, N, seed=7)

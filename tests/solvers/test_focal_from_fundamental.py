@@ -155,11 +155,13 @@ def test_gradients_equal_central_differences(x64):
     assert_derivatives(focal_from_fundamental, both_last, in_units_of_the_image(data))
 
 
+@pytest.mark.slow
 def test_gradients_of_a_shared_focal_length(x64):
     data, _ = problems(1, 12, shared=True)
     assert_derivatives(shared_focal_from_fundamental, shared_last, in_units_of_the_image(data))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [focal_from_fundamental, shared_focal_from_fundamental])
 def test_gradients_are_finite_everywhere(solver):
     gradient = jax.jit(jax.vmap(jax.grad(lambda *x: jnp.sum(solver(*x).models), (0, 1, 2)), -1, -1))

@@ -10,6 +10,8 @@ from tests.solvers.problems import lanes, recall, solve_in_batches
 from vojax.solvers import generalized_relative_pose
 from vojax.solvers._generalized_relative import correspondences
 
+pytestmark = pytest.mark.optimized
+
 N = 17
 solve_last = jax.jit(jax.vmap(generalized_relative_pose, in_axes=-1, out_axes=-1))
 DEGENERATE = ["one centre", "one correspondence", "zero ray", "zeros", "nan", "inf"]

@@ -37,6 +37,7 @@ def solve(points0, points1, mask0=None, mask1=None):
     return jax.tree.map(np.asarray, align(points0, points1, mask0, mask1))
 
 
+@pytest.mark.slow
 def test_aligns_different_samples_better_than_points():
     points0, points1, motions = problems(0)
     ours, theirs = solve(points0, points1), by_points(points0, points1)

@@ -207,6 +207,7 @@ def reference_dlt(pixels0, pixels1, weights):
     return unit_matrices(np.linalg.inv(frames[1]) @ vt[-1].reshape(3, 3) @ frames[0]), s / s[0]
 
 
+@pytest.mark.slow
 def test_dlt_is_the_least_singular_vector(dtype):
     pixels0, pixels1, _ = plane_views(300, N, seed=7, noise=2.0)
     weights = np.random.default_rng(7).uniform(0.1, 2.0, (300, N))
@@ -364,6 +365,7 @@ def test_dlt_in_special_position_is_not_valid(dtype, spoil):
 # --- Both ---
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_on_either_axis(x64):
     pixels0, pixels1, _ = plane_views(8, N, seed=18, noise=0.5)
     last = solve_dlt(pixels0, pixels1, np.ones((8, N)), np.float64)
@@ -378,6 +380,7 @@ def test_vmap_equals_loop_on_either_axis(x64):
         np.testing.assert_allclose(single.models, four.models[i], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     pixels0, pixels1, homography = plane_views(65_536, 4, seed=19)
     many, few = (solve_four(pixels0, pixels1, np.float32, size=size) for size in (65_536, BATCH))
@@ -426,6 +429,7 @@ def check_gradients(function, arguments, steps):
         np.testing.assert_allclose(forward, along, atol=1e-9 * size)
 
 
+@pytest.mark.slow
 def test_four_point_gradients_equal_central_differences(x64):
     pixels0, pixels1, _ = plane_views(20, 4, seed=21)
     keep = np.minimum(thickness(pixels0), thickness(pixels1)) > 0.1
@@ -439,6 +443,7 @@ def test_dlt_gradients_equal_central_differences(x64):
     check_gradients(dlt_function, (pixels0, pixels1, weights), steps=(1e-3, 1e-3, 1e-5))
 
 
+@pytest.mark.slow
 def test_gradients_in_single_precision():
     # In pixels, not scaled: the derivative is taken in the frame of the points.
     pixels0, pixels1, _ = plane_views(BATCH, 4, seed=23)
@@ -470,6 +475,7 @@ def finite_everywhere(seed, count, dtype, gradients=True):
             assert np.isfinite(part).all()
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite_everywhere():
     finite_everywhere(24, BATCH, np.float32)
 

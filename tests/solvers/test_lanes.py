@@ -32,6 +32,7 @@ def test_a_batch_is_what_each_problem_gives(batch, chunk, wrapped):
         assert flags[i] == flag
 
 
+@pytest.mark.slow
 def test_a_batch_of_batches_is_one_long_batch():
     solve = lanes_last(one_kernel(kernel), chunk=4)
     x, y = arrays(5, 3)

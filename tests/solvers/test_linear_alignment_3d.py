@@ -114,6 +114,7 @@ def test_gradients_equal_central_differences(solver, x64):
     check_gradients(total, [tuple(x[0] for x in data)])
 
 
+@pytest.mark.slow
 @SOLVERS
 def test_gradients_are_finite_everywhere(solver):
     gradient = jax.jit(jax.vmap(jax.grad(lambda *data: jnp.sum(solver(*data).models), (0, 1, 2)), -1, -1))

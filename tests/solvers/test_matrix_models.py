@@ -163,6 +163,7 @@ def test_essential_chart_first_turns_the_translation(x64):
     np.testing.assert_allclose(np.abs(np.sum(np.linalg.svd(only_rotation)[0][..., 2] * null, axis=-1)), 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_essential_chart_is_finite_anywhere(dtype):
     for matrix in (np.zeros((3, 3)), np.eye(3), np.ones((3, 3)), np.diag([1.0, 0.0, 0.0])):
         matrix = jnp.asarray(matrix, dtype)

@@ -80,6 +80,7 @@ def test_basis_of_rows_along_an_axis(dtype):
         np.testing.assert_allclose(basis @ basis.T, np.eye(3), atol=4 * EPS[dtype])
 
 
+@pytest.mark.slow
 def test_one_problem_equals_many(x64):
     rows = np.random.default_rng(5).normal(size=(20, 5, 9))
     many = solve(rows, np.float64)

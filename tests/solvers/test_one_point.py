@@ -191,6 +191,7 @@ def test_gradients_equal_central_differences(x64):
     check_gradients(one_point, one_point_data(drive(16, 1, seed=11, mounted=True)), 4)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     check_finite_gradients(one_point, mixed(2048, seed=12), np.float32)
 
@@ -210,6 +211,7 @@ def test_finds_the_truth_in_many_problems(dtype):
     assert (errors < (1e-3 if dtype == jnp.float32 else 1e-6)).mean() >= (0.998 if dtype == jnp.float32 else 0.9999)
 
 
+@pytest.mark.slow
 def test_vmap_equals_a_loop_on_either_axis(x64):
     data = one_point_data(drive(64, 1, seed=14, mounted=True))
     last, first = solve(data, np.float64), solve_first(*data)

@@ -97,6 +97,7 @@ def test_finds_the_poses_poselib_finds(x64):
     assert extra <= 3
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop(x64):
     points, bearings, *_ = absolute_pose_problems(16, seed=4)
     batched = solve(points, bearings, np.float64)
@@ -106,6 +107,7 @@ def test_vmap_equals_loop(x64):
         np.testing.assert_allclose(single.models.wxyz_xyz, batched.models.wxyz_xyz[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_batch_axis_does_not_matter():
     points, bearings, *_ = (x.astype(np.float32) for x in absolute_pose_problems(500, seed=5))
     first = solve_first(points, bearings)
@@ -117,6 +119,7 @@ def test_batch_axis_does_not_matter():
     assert difference.max() < np.finfo(np.float32).eps ** 0.5
 
 
+@pytest.mark.slow
 def test_batch_of_batches_and_shared_points():
     points, bearings, *_ = (x.astype(np.float32) for x in absolute_pose_problems(12, seed=5))
     last = solve(points, bearings, np.float32)
@@ -132,6 +135,7 @@ def test_batch_of_batches_and_shared_points():
     assert shared.valid.shape == (4, 4)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     # Some versions of XLA compute fused loops wrongly from some thousand lanes on.
     points, bearings, rotation, translation = absolute_pose_problems(65_536, seed=6)
@@ -147,6 +151,7 @@ def test_many_lanes_give_what_few_give():
     assert (exact.valid.sum(axis=-1) == many.valid.sum(axis=-1)).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_scale_and_field_of_view(x64):
     points, bearings, rotation, translation = absolute_pose_problems(500, seed=7)
     for size in (1e-4, 1e4):
@@ -261,6 +266,7 @@ def finite_gradients(seed, count, dtype):
         assert np.isfinite(part).all()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     finite_gradients(12, 4000, np.float32)
 

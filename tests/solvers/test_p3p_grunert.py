@@ -117,6 +117,7 @@ def test_finds_the_truth_in_many_problems(dtype):
         assert recall(candidates, rotation, translation, 1e-6) >= 0.9999
 
 
+@pytest.mark.slow
 def test_finds_the_poses_p3p_and_poselib_find(x64):
     points, bearings, *_ = absolute_pose_problems(1000, seed=3)
     ours, theirs = (solve_in_batches(f, points, bearings, dtype=np.float64) for f in (solve_last, other_last))
@@ -201,6 +202,7 @@ def test_danger_cylinder(dtype):
     assert np.mean(best < (3e-2 if dtype == jnp.float32 else 1e-5)) > 0.9
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop(x64):
     points, bearings, *_ = absolute_pose_problems(16, seed=4)
     batched = solve(points, bearings, np.float64)
@@ -211,6 +213,7 @@ def test_vmap_equals_loop(x64):
         np.testing.assert_allclose(candidates.models.wxyz_xyz, batched.models.wxyz_xyz[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_batch_axis_does_not_matter():
     points, bearings, *_ = (x.astype(np.float32) for x in absolute_pose_problems(500, seed=5))
     first = jax.jit(jax.vmap(p3p_grunert))(points, bearings)
@@ -285,6 +288,7 @@ def test_gradients_equal_central_differences(x64):
             np.testing.assert_allclose(ahead, back, rtol=1e-9, atol=1e-9 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     points, bearings = mixed(12, 2048)
     gradient = jax.jit(jax.vmap(jax.grad(lambda x, f: jnp.sum(p3p_grunert(x, f).models.wxyz_xyz), (0, 1)), -1, -1))
@@ -374,6 +378,7 @@ def test_gradient_of_the_chosen_pose(x64):
         assert (gradient[3] == 0).all()  # the fourth point chooses, and moves nothing
 
 
+@pytest.mark.slow
 def test_one_slot_of_candidates():
     points, bearings, *_ = (x.astype(np.float32) for x in four_points(2048, seed=19))
     first = jax.tree.map(lambda x: jnp.asarray(x[0]), solve(points[:, :3], bearings[:, :3], np.float32))

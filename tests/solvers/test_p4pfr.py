@@ -52,6 +52,7 @@ def test_valid_slots_reproduce_the_pixels(x64):
     assert error[candidates.valid].max() < 1e-2
 
 
+@pytest.mark.slow
 def test_finds_what_five_points_have_in_common(x64):
     # A solution of five points is one of any four of them.
     points, pixels, *_ = problems(500, 5, points=5)
@@ -99,6 +100,7 @@ def test_nothing_is_ever_infinite(dtype):
             assert np.isfinite(x).all()
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     # A well-conditioned problem, with pixels of the order of one, so that the distortion is too.
     points, pixels, *_ = problems(256, 13, points=4)

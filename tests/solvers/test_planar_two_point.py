@@ -80,6 +80,7 @@ def test_finds_the_poses_poselib_finds(x64):
     assert only_ours <= 3
 
 
+@pytest.mark.slow
 def test_half_turn(x64):
     # tan(θ/2) is infinite.
     rng = np.random.default_rng(5)
@@ -167,6 +168,7 @@ def test_gradients_equal_central_differences(x64):
     check_gradients(planar_two_point, planar_problems(16, seed=11)[0], 4)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     check_finite_gradients(planar_two_point, mixed(planar_problems(2048, seed=12)[0], seed=12), np.float32)
 
@@ -179,6 +181,7 @@ def test_nothing_is_ever_infinite(dtype):
     check_finite_gradients(planar_two_point, mixed(planar_problems(100_000, seed=9)[0], seed=9), dtype)
 
 
+@pytest.mark.slow
 def test_vmap_equals_a_loop_on_either_axis(x64):
     data, *_ = planar_problems(64, seed=13)
     last, first = solve(data, np.float64), solve_first(*data)
@@ -200,6 +203,7 @@ def test_noise_moves_the_pose_smoothly(x64):
     np.testing.assert_allclose(medians, medians[0], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     data, rotation, translation = planar_problems(65_536, seed=15)
     many, few = solve(data, np.float32, size=65_536), solve(data, np.float32)

@@ -60,6 +60,7 @@ def test_equals_scipy(x64):
         np.testing.assert_allclose(pose[:3, :3], expected.as_matrix(), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_no_rotation_is_better(x64):
     # Sets that have nothing in common, so that the optimum is anywhere on the sphere of quaternions.
     rng = np.random.default_rng(3)
@@ -81,6 +82,7 @@ def test_special_rotations(dtype):
     assert recall(candidates, rotation, np.ones((10, 3)), 1e-4 if dtype == jnp.float32 else 1e-12) == 1.0
 
 
+@pytest.mark.slow
 def test_mirrored_sets_give_the_best_rotation(x64):
     points0, _, rotation, _ = alignment_problems(500, 8, seed=5)
     points1 = np.einsum("bij,bnj->bni", rotation, points0 * np.array([1.0, 1.0, -1.0]))
@@ -91,6 +93,7 @@ def test_mirrored_sets_give_the_best_rotation(x64):
     assert np.quantile(np.abs(found - expected).max(axis=(1, 2, 3)), 0.99) < 1e-11
 
 
+@pytest.mark.slow
 def test_coinciding_smaller_eigenvalues(dtype):
     # A cube: three equal singular values, so three equal eigenvalues below the largest. And a square.
     cube = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]), axis=-1).reshape(8, 3)
@@ -161,6 +164,7 @@ def test_gradients_equal_central_differences(x64):
     check_gradients(weighted_sum, list(zip(points0, points1, weights, strict=True)))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     def total(points0, points1, weights):
         return jnp.sum(procrustes_quaternion(points0, points1, weights).models.wxyz_xyz)

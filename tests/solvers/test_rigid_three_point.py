@@ -117,6 +117,7 @@ def test_gradients_equal_central_differences(x64):
     check_gradients(weighted_sum, list(zip(points0, points1, strict=True)))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     gradient = jax.jit(
         jax.vmap(jax.grad(lambda x, y: jnp.sum(rigid_three_point(x, y).models.wxyz_xyz), (0, 1)), -1, -1)

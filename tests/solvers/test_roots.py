@@ -238,6 +238,7 @@ def test_pack_moves_the_valid_to_the_front():
     np.testing.assert_array_equal(valid, [True, True, True, False])
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     coefficients = np.random.default_rng(80).normal(size=(65_536, 5))
     many, many_valid = solve(coefficients, np.float32, size=65_536)

@@ -128,6 +128,7 @@ def test_noise_moves_the_rotation_smoothly(x64):
     assert errors[0] < 3e-4
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_on_either_axis(x64):
     rays0, rays1, weights, _ = problems(16, seed=8, noise=0.01)
     last = solve(rays0, rays1, weights, np.float64)
@@ -143,6 +144,7 @@ def test_vmap_equals_loop_on_either_axis(x64):
     )
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     rays0, rays1, weights, rotation = problems(65_536, seed=9)
     many = solve(rays0, rays1, weights, np.float32, size=65_536)
@@ -204,6 +206,7 @@ def finite_everywhere(seed, count, dtype):
         assert np.isfinite(part).all()
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite_everywhere():
     finite_everywhere(12, 2048, np.float32)
 

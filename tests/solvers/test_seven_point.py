@@ -113,6 +113,7 @@ def test_impossible_problems_have_no_valid_slot(spoil, dtype):
     assert not solve_in_batches(solve_last, first, second, dtype=dtype, size=SIZE).valid.any()
 
 
+@pytest.mark.slow
 def test_values_and_gradients_are_finite_everywhere(dtype):
     first, second = spoiled(*pixel_problems(SIZE, 7, seed=8)[:2], seed=8)
     assert_finite_with_zero_placeholders(solve_in_batches(solve_last, first, second, dtype=dtype, size=SIZE))
@@ -152,6 +153,7 @@ def test_gradients_equal_central_differences(x64):
             np.testing.assert_allclose(ahead, back, rtol=1e-8, atol=1e-8 * size)
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     first, second, _ = pixel_problems(4, 7, seed=10)
     last = solve_in_batches(solve_last, first, second, dtype=np.float64, size=SIZE)
@@ -164,6 +166,7 @@ def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
         np.testing.assert_allclose(calibrated(single.models), calibrated(last.models[i]), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     many, _ = errors_of(65_536, np.float32, seed=11, size=65_536)
     few, _ = errors_of(65_536, np.float32, seed=11)

@@ -188,6 +188,7 @@ def test_nothing_is_ever_infinite(dtype):
         assert np.isfinite(solve(mixed(125_000, seed), dtype).models.wxyz_xyz).all()
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_batch_axis_does_not_matter(x64):
     data, *_ = problems(16, seed=9)
     batched = solve(data, np.float64)
@@ -222,6 +223,7 @@ def test_gradients_equal_central_differences(x64):
             np.testing.assert_allclose(ahead, back, rtol=1e-9, atol=1e-9 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     gradient = jax.jit(jax.vmap(jax.grad(lambda *data: jnp.sum(up2p(*data).models.wxyz_xyz), (0, 1, 2, 3)), -1, -1))
     for part in gradient(*lanes(*mixed(2048, seed=11), dtype=np.float32)):

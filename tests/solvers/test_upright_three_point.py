@@ -48,6 +48,7 @@ def test_finds_the_truth(dtype, any_turn):
         assert (errors < 1e-6).mean() >= 0.9999
 
 
+@pytest.mark.optimized
 def test_far_points(dtype):
     # A thousand baselines away: in float32 the bearings themselves are rounded to a thousandth of the parallax.
     data, rotation, translation = upright_problems(4096, 3, seed=2, distance=100.0)
@@ -74,6 +75,7 @@ def test_finds_the_poses_poselib_finds(x64):
     assert only_ours <= 3
 
 
+@pytest.mark.slow
 def test_half_turn(x64):
     # tan(θ/2) is infinite.
     rng = np.random.default_rng(5)
@@ -162,6 +164,7 @@ def test_gradients_equal_central_differences(x64):
     check_gradients(upright_three_point, upright_problems(16, 3, seed=11)[0], 4)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_everywhere():
     check_finite_gradients(upright_three_point, mixed(upright_problems(2048, 3, seed=12)[0], seed=12), np.float32)
 
@@ -174,6 +177,7 @@ def test_nothing_is_ever_infinite(dtype):
     check_finite_gradients(upright_three_point, mixed(upright_problems(100_000, 3, seed=9)[0], seed=9), dtype)
 
 
+@pytest.mark.slow
 def test_vmap_equals_a_loop_on_either_axis(x64):
     data, *_ = upright_problems(64, 3, seed=13)
     last, first = solve(data, np.float64), solve_first(*data)
@@ -195,6 +199,7 @@ def test_noise_moves_the_pose_smoothly(x64):
     np.testing.assert_allclose(medians, medians[0], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_many_lanes_give_what_few_give():
     data, rotation, translation = upright_problems(65_536, 3, seed=15)
     many, few = solve(data, np.float32, size=65_536), solve(data, np.float32)

@@ -15,7 +15,7 @@ from rich.console import Console
 from vojax._version import __version__
 from vojax.cameras import RectifiedStereo
 from vojax.metrics import Trajectory, TrajectoryWriter, evaluate
-from vojax.odometry import PIPELINES, FrameEstimate, StereoOdometryOptions
+from vojax.odometry import PIPELINES, FrameEstimate
 from vojax.viz import draw_tracks, plot_trajectory, save_figure
 
 from ._prefetch import prefetch
@@ -105,8 +105,10 @@ def run_sequence(
         ValueError: An unknown pipeline, an option out of range, or a frame that cannot be used.
         OSError: The folder cannot be written to.
     """
-    if pipeline not in PIPELINES:
-        raise ValueError(f"unknown pipeline {pipeline!r}; choose one of {', '.join(PIPELINES)}")
+    # The others take images that this loop does not read yet.
+    pipelines = {name: one for name, one in PIPELINES.items() if one.images == "pair"}
+    if pipeline not in pipelines:
+        raise ValueError(f"unknown pipeline {pipeline!r}; choose one of {', '.join(pipelines)}")
     if seed < 0:
         raise ValueError(f"the seed is {seed}; expected 0 or more")
     if max_frames is not None and max_frames < 1:
@@ -116,7 +118,8 @@ def run_sequence(
     prepare_folder(out)
     console = Console() if console is None else console
     frames = len(sequence) if max_frames is None else min(max_frames, len(sequence))
-    odometry = PIPELINES[pipeline](sequence.stereo, StereoOdometryOptions(window=window), seed=seed)
+    chosen = pipelines[pipeline]
+    odometry = chosen.odometry(sequence.stereo, chosen.options(window=window), seed=seed)
     log, clock = _Log(), FrameClock()
     failure: Exception | None = None
     try:

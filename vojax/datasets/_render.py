@@ -166,7 +166,23 @@ def render_depth(view: View, *, width: int, height: int) -> Array:
 
 @functools.partial(jax.jit, static_argnames=("width", "height", "supersample"))
 def render_image(view: View, key: Array, noise: Array, *, width: int, height: int, supersample: int) -> Array:
-    """One picture, uint8, with sensor noise of standard deviation `noise` gray levels."""
+    """One picture, uint8, with sensor noise of standard deviation `noise` gray levels.
+
+    A view with a leading axis on all its arrays is a moving camera: what it sees in turn is averaged.
+    """
+    if jnp.ndim(view.rotation) == 3:
+        turn = functools.partial(_radiance, width=width, height=height, supersample=supersample)
+        radiance = jnp.mean(lax.map(turn, view), axis=0)
+        gain = view.light[0, 0]
+    else:
+        radiance, gain = _radiance(view, width=width, height=height, supersample=supersample), view.light[0]
+    # A film-like curve lifts the shade.
+    gray = 255.0 * jnp.power(jnp.clip(gain * radiance, 1e-4, 1.0), 1 / 1.4)
+    gray = gray + noise * jax.random.normal(key, gray.shape, jnp.float32)
+    return jnp.clip(jnp.round(gray), 0.0, 255.0).astype(jnp.uint8)
+
+
+def _radiance(view: View, *, width: int, height: int, supersample: int) -> Array:
     u, v = _pixel_grid(width, height)
     directions = _directions(view, u, v)
     offsets = [(i + 0.5) / supersample - 0.5 for i in range(supersample)]
@@ -174,12 +190,7 @@ def render_image(view: View, key: Array, noise: Array, *, width: int, height: in
     x, y, z = (jnp.stack([d, *(_shifted(d, a, b, view, i) for a, b in samples)]) for i, d in enumerate(directions))
     codes = lax.optimization_barrier(_nearest(view, (x, y, z)))
     radiance = lax.optimization_barrier(_shade(view, directions, codes[0]))
-    if samples:
-        radiance = _blend_outlines(radiance, codes[0], codes[1:], samples)
-    # A film-like curve lifts the shade.
-    gray = 255.0 * jnp.power(jnp.clip(view.light[0] * radiance, 1e-4, 1.0), 1 / 1.4)
-    gray = gray + noise * jax.random.normal(key, gray.shape, jnp.float32)
-    return jnp.clip(jnp.round(gray), 0.0, 255.0).astype(jnp.uint8)
+    return _blend_outlines(radiance, codes[0], codes[1:], samples) if samples else radiance
 
 
 def _shifted(component: Array, a: float, b: float, view: View, row: int) -> Array:

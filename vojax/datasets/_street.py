@@ -8,6 +8,9 @@ import numpy as np
 BLOCK = 48
 _BEND_START, _BEND_RAMP, _BEND_FRAMES = 13, 5, 25
 _EXTENSION = 60
+# A lap: four longer blocks that bend by a right angle each, to the same side. Turned copies of one block close exactly.
+LAP = 500
+_LAP_BEND_START = 60
 GROUND_Y = 1.65
 GRID_STEP = 0.5
 _OFF_LANE = 30.0
@@ -22,15 +25,19 @@ class Path:
         z: Position, metres.
         heading: Angle from +z towards +x, radians.
         distance: Arc length, metres.
+        closed: True for a lap that ends where it begins; frames and arc lengths then go round and round.
     """
 
     x: np.ndarray
     z: np.ndarray
     heading: np.ndarray
     distance: np.ndarray
+    closed: bool = False
 
     def at(self, distance: np.ndarray, lateral: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position and heading at an arc length, `lateral` metres to the right."""
+        if self.closed:
+            distance = np.mod(distance, self.distance[-1])
         heading = np.interp(distance, self.distance, self.heading)
         x = np.interp(distance, self.distance, self.x) + lateral * np.cos(heading)
         z = np.interp(distance, self.distance, self.z) - lateral * np.sin(heading)
@@ -40,6 +47,13 @@ class Path:
         """The same for one arc length."""
         x, z, heading = self.at(np.array([distance]), lateral)
         return float(x[0]), float(z[0]), float(heading[0])
+
+    def at_frame(self, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Position and heading at a frame, or between two."""
+        frame = np.mod(frame, LAP) if self.closed else frame
+        count = np.arange(len(self.x))
+        x, z, heading = (np.interp(frame, count, values) for values in (self.x, self.z, self.heading))
+        return x, z, heading
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,19 +82,41 @@ def make_path(frames: int, seed: int) -> Path:
     rate = np.zeros(count)
     for block in range(blocks):
         angle = np.deg2rad(rng.uniform(68, 86)) * first_sign * (-1.0) ** block
-        k = np.arange(_BEND_FRAMES) + 0.5
-        ramp = np.clip(np.minimum(k, _BEND_FRAMES - k) / _BEND_RAMP, 0, 1)
-        ramp = ramp * ramp * (3 - 2 * ramp)
         start = block * BLOCK + _BEND_START
-        rate[start : start + _BEND_FRAMES] = angle * ramp / ramp.sum()
+        rate[start : start + _BEND_FRAMES] = _bend(angle)
     speed = 0.90 + 0.05 * np.sin(2 * np.pi * np.arange(count) / 31 + phase) - 0.08 * np.abs(rate) / 0.065
     rate = np.concatenate([rate, np.zeros(_EXTENSION)])
     speed = np.concatenate([speed, np.ones(_EXTENSION)])
+    return Path(*_integrate(rate, speed))
+
+
+def make_lap(seed: int) -> Path:
+    """A lap of `LAP` frames: four straights and four bends of 90 degrees, up to 5 degrees a frame."""
+    rng = np.random.default_rng([seed, 1])
+    sign = rng.choice([-1.0, 1.0])
+    block = LAP // 4
+    rate = np.zeros(block)
+    rate[_LAP_BEND_START : _LAP_BEND_START + _BEND_FRAMES] = sign * _bend(np.pi / 2)
+    speed = 0.90 + 0.05 * np.sin(2 * np.pi * np.arange(block) / 31) - 0.08 * np.abs(rate) / 0.065
+    rate, speed = np.tile(rate, 4), np.tile(speed, 4)
+    return Path(*_integrate(rate, speed), closed=True)
+
+
+def _bend(angle: float) -> np.ndarray:
+    """Change of heading per frame in a bend, with smooth ends."""
+    k = np.arange(_BEND_FRAMES) + 0.5
+    ramp = np.clip(np.minimum(k, _BEND_FRAMES - k) / _BEND_RAMP, 0, 1)
+    ramp = ramp * ramp * (3 - 2 * ramp)
+    return angle * ramp / ramp.sum()
+
+
+def _integrate(rate: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """x, z, heading and arc length from changes of heading and lengths of steps."""
     heading = np.concatenate([[0.0], np.cumsum(rate)])
     middle = heading[:-1] + rate / 2
     x = np.concatenate([[0.0], np.cumsum(speed * np.sin(middle))])
     z = np.concatenate([[0.0], np.cumsum(speed * np.cos(middle))])
-    return Path(x, z, heading, np.concatenate([[0.0], np.cumsum(speed)]))
+    return x, z, heading, np.concatenate([[0.0], np.cumsum(speed)])
 
 
 def street_from_camera(path: Path, frame: np.ndarray, seed: int) -> np.ndarray:
@@ -91,12 +127,12 @@ def street_from_camera(path: Path, frame: np.ndarray, seed: int) -> np.ndarray:
     wave = np.sin(2 * np.pi * frame[:, None] / period + phase)
     sway, heave = 0.08 * wave[:, 0], 0.03 * wave[:, 1]
     roll, pitch, yaw = (np.deg2rad(a) * wave[:, j] for a, j in ((1.0, 2), (0.7, 3), (0.7, 4)))
-    heading = path.heading[frame] + yaw
+    x, z, heading = path.at_frame(frame)
     pose = np.zeros((len(frame), 4, 4))
-    pose[:, :3, :3] = _rot(heading, 1) @ _rot(pitch, 0) @ _rot(roll, 2)
-    pose[:, 0, 3] = path.x[frame] + sway * np.cos(path.heading[frame])
+    pose[:, :3, :3] = _rot(heading + yaw, 1) @ _rot(pitch, 0) @ _rot(roll, 2)
+    pose[:, 0, 3] = x + sway * np.cos(heading)
     pose[:, 1, 3] = heave
-    pose[:, 2, 3] = path.z[frame] - sway * np.sin(path.heading[frame])
+    pose[:, 2, 3] = z - sway * np.sin(heading)
     pose[:, 3, 3] = 1
     return pose
 
@@ -190,6 +226,8 @@ def _backdrop(builder: _Builder, end: float) -> None:
             yaw = heading - np.pi / 2 + rng.uniform(-0.3, 0.3)
             if builder.clear(x, z, yaw, half, half, 12.0):
                 builder.add((x, z, yaw, half, half, GROUND_Y - height, GROUND_Y), house_material(rng))
+    if builder.path.closed:
+        return
     x, z, heading = builder.path.place(end)
     x, z = x + 9 * np.sin(heading), z + 9 * np.cos(heading)
     builder.add((x, z, heading, 17.0, 5.0, GROUND_Y - 11.5, GROUND_Y), house_material(rng))

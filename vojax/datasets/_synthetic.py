@@ -11,10 +11,13 @@ from . import _render, _street
 
 _WINDOW = 256  # Lane grid cells passed to the renderer, per side.
 _KEPT_FRAMES = 128
+_EXPOSURES = 4  # pictures that a blurred one is averaged from
 
 
 class SyntheticStereoSequence:
     """A stereo camera on a car: a straight, a bend of 70 to 85 degrees, a straight; 10 Hz, about 0.9 m a frame.
+
+    Or laps around a block of houses (`lap`): four straights and four bends of 90 degrees in 500 frames, 450 m.
 
     It reads like a KITTI sequence. The pictures are made when asked for (on the device that JAX uses) and the last 128
     frames are kept. The same arguments give the same pictures; sequences of different lengths share their first frames.
@@ -29,6 +32,8 @@ class SyntheticStereoSequence:
         seed: Fixes the path, the street and the sensor noise.
         focal_px: Focal length, pixels; 0.625 times the width where it is None.
         baseline: Distance between the cameras, metres.
+        lap: Drive around the block, and on and on for more than 500 frames.
+        shutter: Share of 0.1 s in which the shutter is open: the motion blur of a picture.
         stride: Path steps of 0.1 s from one frame to the next.
         lighting_amplitude: Natural logarithm of the largest change of exposure, which swings once in 2.4 s.
         moving_cars: Number of cars driving along: the first goes ahead in the same lane, the second comes towards the
@@ -64,6 +69,8 @@ class SyntheticStereoSequence:
         *,
         focal_px: float | None = None,
         baseline: float = 0.54,
+        lap: bool = False,
+        shutter: float = 0.0,
         stride: int = 1,
         lighting_amplitude: float = 0.0,
         moving_cars: int = 0,
@@ -82,12 +89,13 @@ class SyntheticStereoSequence:
             ("noise_gray", noise_gray, 0),
             ("texture_contrast", texture_contrast, 0),
             ("baseline", baseline, 0),
+            ("shutter", shutter, 0),
         ):
             if value < least:
                 raise ValueError(f"{name} is {value}; expected at least {least}")
         focal_px = 0.625 * width if focal_px is None else float(focal_px)
         self.width, self.height, self.seed, self.stride = width, height, seed, stride
-        self.name = f"synthetic-{seed}"
+        self.name = f"synthetic-{'lap-' if lap else ''}{seed}"
         self.camera = Pinhole(fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2)
         self.stereo = RectifiedStereo(self.camera, baseline=baseline)
         self._intrinsics = np.array([focal_px, focal_px, (width - 1) / 2, (height - 1) / 2], np.float32)
@@ -97,11 +105,12 @@ class SyntheticStereoSequence:
         self._lighting_amplitude = lighting_amplitude
         self._contrast = texture_contrast
         self._moving_cars = moving_cars
+        self._shutter = shutter
 
         steps = np.arange(frames) * stride
         self.times = steps * 0.1
         self.frame_names = [f"{step:06d}" for step in steps]
-        self._path = _street.make_path(int(steps[-1]) + 1, seed)
+        self._path = _street.make_lap(seed) if lap else _street.make_path(int(steps[-1]) + 1, seed)
         self._street_from_cam = _street.street_from_camera(self._path, steps, seed)
         first_inverse = np.linalg.inv(self._street_from_cam[0])
         self.poses = (first_inverse @ self._street_from_cam)[:, :3, :]
@@ -130,7 +139,7 @@ class SyntheticStereoSequence:
             key = jax.random.fold_in(jax.random.key(self.seed), k * self.stride)
             pair = tuple(
                 _render.render_image(
-                    self._view(k, eye),
+                    self._exposure(k, eye),
                     jax.random.fold_in(key, eye),
                     self._noise,
                     width=self.width,
@@ -146,7 +155,8 @@ class SyntheticStereoSequence:
 
     def depth(self, k: int) -> np.ndarray:
         """Exact depth (camera z, metres) through the pixel centres of the left picture of frame `k`; 0 for the sky."""
-        view = self._view(self._index(k), 0)
+        k = self._index(k)
+        view = self._view(k, 0, self._street_from_cam[k])
         return np.asarray(_render.render_depth(view, width=self.width, height=self.height))
 
     def _index(self, k: int) -> int:
@@ -162,7 +172,7 @@ class SyntheticStereoSequence:
         geometry, materials = [], []
         for car in range(self._moving_cars):
             rng = np.random.default_rng([self.seed, 5, car])
-            here = self._path.distance[step]
+            here = self._path.distance[step % _street.LAP if self._path.closed else step]
             if car % 2 == 0:
                 distance, lateral, turn = here + 9.0 + 5.0 * car + 2.5 * np.sin(2 * np.pi * step / 29 + car), 0.0, 0.0
             else:
@@ -176,8 +186,15 @@ class SyntheticStereoSequence:
             np.concatenate([np.array(materials), self._boxes.materials]),
         )
 
-    def _view(self, k: int, eye: int) -> _render.View:
-        pose = self._street_from_cam[k]
+    def _exposure(self, k: int, eye: int) -> _render.View:
+        """What the camera sees while the shutter is open, the middle of which is the frame's time."""
+        if not self._shutter:
+            return self._view(k, eye, self._street_from_cam[k])
+        part = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
+        poses = _street.street_from_camera(self._path, k * self.stride + self._shutter * part, self.seed)
+        return jax.tree.map(lambda *x: np.stack(x), *(self._view(k, eye, pose) for pose in poses))
+
+    def _view(self, k: int, eye: int, pose: np.ndarray) -> _render.View:
         rotation, left = pose[:3, :3], pose[:3, 3]
         origin = left + eye * self._baseline * rotation[:, 0]
         scene = self._scene(k)

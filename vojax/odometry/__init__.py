@@ -1,10 +1,19 @@
+from ._absolute_motion import AbsoluteMotionOptions as AbsoluteMotionOptions
+from ._bootstrap import BootstrapOptions as BootstrapOptions
+from ._frame import Flag as Flag
+from ._frame import FrameEstimate as FrameEstimate
 from ._keyframes import KeyframeOptions as KeyframeOptions
 from ._keyframes import is_keyframe as is_keyframe
+from ._mono import MonoOdometry as MonoOdometry
+from ._mono import MonoOdometryOptions as MonoOdometryOptions
+from ._mono_window import MonoWindowOptions as MonoWindowOptions
 from ._motion import MotionOptions as MotionOptions
+from ._pipelines import PIPELINES as PIPELINES
+from ._pipelines import Pipeline as Pipeline
+from ._planar_motion import PlanarMotionOptions as PlanarMotionOptions
 from ._rectification import DisparityCalibration as DisparityCalibration
+from ._relative_motion import RelativeMotionOptions as RelativeMotionOptions
+from ._relative_scale import relative_scale as relative_scale
 from ._sliding_window import WindowOptions as WindowOptions
-from ._stereo import FrameEstimate as FrameEstimate
 from ._stereo import StereoOdometry as StereoOdometry
 from ._stereo import StereoOdometryOptions as StereoOdometryOptions
-
-PIPELINES = {"stereo-3d2d": StereoOdometry}

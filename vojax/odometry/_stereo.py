@@ -25,6 +25,7 @@ from vojax.features import (
 )
 from vojax.lie import SE3
 
+from ._frame import FrameEstimate
 from ._keyframes import KeyframeOptions, is_keyframe
 from ._motion import Motion, MotionOptions, StereoFeatures, stereo_motion
 from ._rectification import DisparityCalibration
@@ -54,28 +55,6 @@ class StereoOdometryOptions:
     motion: MotionOptions = MotionOptions()
     keyframes: KeyframeOptions = KeyframeOptions()
     sliding_window: WindowOptions = WindowOptions()
-
-
-class FrameEstimate(NamedTuple):
-    """What is known after a frame.
-
-    Attributes:
-        world_from_cam: Pose `[4, 4]`, float64; the first frame is the world.
-        num_inliers: Features that agree with the motion; 0 for the first frame.
-        bridged: True where the frame could not be tracked and the motion before it was repeated.
-        keyframe: True where the frame entered the window.
-        pixels: The inliers, in this image.
-        previous_pixels: The same in the image before.
-        disparity: The same, px; 0 where not matched.
-    """
-
-    world_from_cam: np.ndarray
-    num_inliers: int
-    bridged: bool
-    keyframe: bool
-    pixels: np.ndarray
-    previous_pixels: np.ndarray
-    disparity: np.ndarray
 
 
 class _Frame(NamedTuple):
