@@ -339,15 +339,16 @@ def test_images_of_another_size_are_refused(street):
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "metres"), [("mono-3d2d", 1.0), ("mono-2d2d", 3.0), ("planar-1pt", 3.0)])
-@pytest.mark.parametrize("window", [True, False])
-def test_kitti_00_clip(data_root, name, metres, window):
+@pytest.mark.parametrize(
+    ("name", "window", "metres"),
+    [("mono-3d2d", True, 1.0), ("mono-2d2d", True, 3.0), ("mono-3d2d", False, 1.5), ("mono-2d2d", False, 4.0)],
+)
+def test_kitti_00_clip(data_root, name, window, metres):
     sequence = KittiSequence(data_root / "kitti", "00", stereo=False)
     chosen = PIPELINES[name]
     odometry = chosen.odometry(sequence.camera, chosen.options(window=window))
     estimates = [odometry.step(sequence.images(k)[0]) for k in range(len(sequence))]
     poses = np.concatenate([[*e.earlier, e.world_from_cam] for e in estimates if not e.pending])
     assert len(poses) == len(sequence)
-    if window:
-        assert not any(e.bridged for e in estimates)
-    assert measure(sequence, poses).ate_rmse_m <= metres * (1.0 if window else 1.5)
+    assert not any(e.bridged for e in estimates)
+    assert measure(sequence, poses).ate_rmse_m <= metres

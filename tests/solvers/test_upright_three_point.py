@@ -19,6 +19,8 @@ from tests.solvers.upright_problems import (
 from vojax.solvers import upright_three_point
 from vojax.solvers._upright_three_point import arrays
 
+pytestmark = pytest.mark.optimized
+
 solve_last = jax.jit(jax.vmap(upright_three_point, in_axes=-1, out_axes=-1))
 solve_first = jax.jit(jax.vmap(upright_three_point))
 
@@ -48,7 +50,6 @@ def test_finds_the_truth(dtype, any_turn):
         assert (errors < 1e-6).mean() >= 0.9999
 
 
-@pytest.mark.optimized
 def test_far_points(dtype):
     # A thousand baselines away: in float32 the bearings themselves are rounded to a thousandth of the parallax.
     data, rotation, translation = upright_problems(4096, 3, seed=2, distance=100.0)
