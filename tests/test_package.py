@@ -99,6 +99,19 @@ def test_importing_vojax_is_light_quiet_and_leaves_jax_alone():
     assert result.stderr == ""
 
 
+def test_no_module_computes_when_it_is_imported():
+    # A JAX that has computed takes no more settings: no platform, no number of devices.
+    result = run_fresh(
+        "import importlib, pkgutil, jax, vojax\n"
+        "names = [m.name for m in pkgutil.walk_packages(vojax.__path__, 'vojax.') if not m.name.endswith('__main__')]\n"
+        "for name in names: importlib.import_module(name)\n"
+        "jax.config.update('jax_num_cpu_devices', 3)\n"
+        "print(len(names) > 200, len(jax.devices('cpu')))\n"
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "True 3"
+
+
 def test_version_is_that_of_the_installed_package():
     try:
         installed = importlib.metadata.version("vojax")

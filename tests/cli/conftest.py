@@ -9,7 +9,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from vojax.cli import main
-from vojax.odometry import PIPELINES, FrameEstimate
+from vojax.odometry import PIPELINES, Flag, FrameEstimate
 
 FRAMES = 6
 ROW = "20 0 16 {} 0 20 8 0 0 0 1 0"
@@ -87,24 +87,43 @@ class FakeOdometry:
 
     made: ClassVar[list["FakeOdometry"]] = []
     bridged: tuple[int, ...] = ()
+    pending: tuple[int, ...] = ()
+    flagged: ClassVar[dict[int, tuple[Flag, ...]]] = {}
 
-    def __init__(self, stereo, options, *, seed=0):
-        self.stereo, self.options, self.seed = stereo, options, seed
-        self.images = []
+    def __init__(self, camera, options, *, seed=0):
+        self.camera, self.options, self.seed = camera, options, seed
+        self.images = []  # of each frame; None for one that was skipped
+        self.waiting = 0
         type(self).made.append(self)
 
     def before(self, k: int) -> None:
         """What happens as frame k arrives."""
 
-    def step(self, left, right):
+    def step(self, *images):
         k = len(self.images)
         self.before(k)
-        self.images.append((left, right))
-        pose = np.eye(4)
-        pose[:3, 3] = [0.02 * k, 0.0, 1.01 * k]
+        self.images.append(images)
+        if k in self.pending:
+            self.waiting += 1
+            return FrameEstimate(np.eye(4), pending=True)
         points = np.array([[3.0, 4.0], [20.0, 9.0]], np.float32)
         inliers = 0 if k in self.bridged or k == 0 else 100 + k
-        return FrameEstimate(pose, inliers, k in self.bridged, k % 2 == 0, points, points - 1.0)
+        earlier = np.array([self.pose(j) for j in range(k - self.waiting, k)]).reshape(-1, 4, 4)
+        self.waiting = 0
+        return FrameEstimate(
+            self.pose(k), inliers, k in self.bridged, k % 2 == 0, points, points - 1.0,
+            flags=self.flagged.get(k, ()), earlier=earlier,
+        )  # fmt: skip
+
+    def skip(self):
+        self.images.append(None)
+        return FrameEstimate(self.pose(len(self.images) - 1), bridged=True, flags=(Flag.unreadable,))
+
+    @staticmethod
+    def pose(k: int) -> np.ndarray:
+        pose = np.eye(4)
+        pose[:3, 3] = [0.02 * k, 0.0, 1.01 * k]
+        return pose
 
 
 @pytest.fixture
@@ -114,15 +133,17 @@ def drawn_for_real():
 
 @pytest.fixture
 def fake(request, monkeypatch):
-    """The pipeline without its computations, and pictures that only say how many poses they show."""
+    """Pipelines without their computations, and pictures that only say how many poses they show."""
 
     class Fake(FakeOdometry):
         made: ClassVar[list] = []
 
-    monkeypatch.setitem(PIPELINES, "stereo-3d2d", PIPELINES["stereo-3d2d"]._replace(odometry=Fake))
+    for name, pipeline in PIPELINES.items():
+        monkeypatch.setitem(PIPELINES, name, pipeline._replace(odometry=Fake))
     if "drawn_for_real" not in request.fixturenames:
         monkeypatch.setattr("vojax.cli._run.plot_trajectory", lambda estimate, truth, **_: f"{len(estimate)} poses")
-        monkeypatch.setattr("vojax.cli._run.save_figure", lambda figure, path: path.write_text(figure))
+        monkeypatch.setattr("vojax.cli._run.plot_timings", lambda stages, **_: " ".join(stages))
+        monkeypatch.setattr("vojax.cli._run.save_figure", lambda figure, path, **_: path.write_text(str(figure)))
     return Fake
 
 

@@ -14,8 +14,8 @@ from vojax.metrics import read_trajectory
 @pytest.mark.parametrize(
     ("arguments", "found", "expected"),
     [
-        (["fly"], "'fly'", "demo, run, eval"),
-        (["--fly"], "'--fly'", "demo, run, eval"),
+        (["fly"], "'fly'", "demo, run, compare, eval"),
+        (["--fly"], "'--fly'", "demo, run, compare, eval"),
         (["demo", "--sead", "1"], "--sead", "--seed"),
         (["demo", "--colour", "red"], "--colour", "vojax demo --help"),
         (["demo", "--seed", "one"], "'one'", "whole number"),
@@ -47,10 +47,12 @@ def test_the_sentence_does_not_depend_on_the_terminal(vojax_command, monkeypatch
         "vojax: error: unrecognized options: --sead, 1; did you mean --seed N?; see vojax demo --help\n"
     )
     assert vojax_command("run", "x", "--dataset", "mars", "--pipeline", "p", "--out", "o").error == (
-        "vojax: error: --dataset: found 'mars', expected one of 'kitti'; see vojax run --help\n"
+        "vojax: error: --dataset: found 'mars', expected one of 'kitti', 'tum', 'euroc', '7scenes', 'images'; "
+        "see vojax run --help\n"
     )
     assert vojax_command("run", "--out", "o").error == (
-        "vojax: error: missing from vojax run: PATH, --dataset {kitti}, --pipeline NAME; see vojax run --help\n"
+        "vojax: error: missing from vojax run: PATH, --dataset {kitti,tum,euroc,7scenes,images}, --pipeline NAME; "
+        "see vojax run --help\n"
     )
 
 
@@ -148,21 +150,42 @@ def truncate(path):
     path.write_bytes(data[: len(data) // 2])
 
 
-@pytest.mark.parametrize("damage", [truncate, lambda path: path.write_bytes(b""), lambda path: path.write_text("text")])
-def test_damaged_image_in_mid_run_keeps_what_was_done(run_kitti, kitti, fake, tmp_path, damage):
+DAMAGES = [truncate, lambda path: path.write_bytes(b""), lambda path: path.write_text("text")]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_image_in_mid_run_is_bridged_and_said(run_kitti, kitti, fake, tmp_path, damage):
     damage(kitti / "sequences" / "07" / "image_1" / "000003.png")
     outcome = run_kitti()
+    assert outcome.status == 0
+    assert fake.made[0].images[3] is None
+    assert "1 frame could not be read: 3 (3:" in outcome.stdout
+    assert "000003.png" in outcome.stdout
+    for format, name in (("tum", "trajectory.txt"), ("kitti", "trajectory_kitti.txt")):
+        trajectory = read_trajectory(tmp_path / "out" / name, format)
+        np.testing.assert_allclose(trajectory.positions[:, 2], 1.01 * np.arange(6), atol=1e-9)
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["failures"], metrics["error"]) == (6, 1, None)
+    assert metrics["bridged_frames"] == metrics["unreadable_frames"] == [3]
+    assert metrics["flags"] == {"the frame could not be read": 1}
+
+
+def test_images_that_end_early_keep_what_was_done(run_kitti, kitti, fake, tmp_path):
+    for k, damage in zip((3, 4, 5), DAMAGES, strict=True):
+        damage(kitti / "sequences" / "07" / "image_1" / f"{k:06d}.png")
+    outcome = run_kitti()
     error = outcome.error
-    assert "frame 3" in error
+    assert "ends early, with frame 2 of 6" in error
     assert "000003.png" in error
-    assert "3 poses" in error
-    assert "out" in error
+    assert "3 poses kept in" in error
     for format, name in (("tum", "trajectory.txt"), ("kitti", "trajectory_kitti.txt")):
         trajectory = read_trajectory(tmp_path / "out" / name, format)
         np.testing.assert_allclose(trajectory.positions[:, 2], [0, 1.01, 2.02], atol=1e-9)
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["frames"] == 3
     assert metrics["frames_in_sequence"] == 6
+    assert metrics["failures"] == 0
+    assert metrics["unreadable_frames"] == [3, 4, 5]
     assert "000003.png" in metrics["error"]
     assert metrics["path_length_m"] == pytest.approx(2.0)
     assert (tmp_path / "out" / "trajectory.png").read_text() == "3 poses"
@@ -177,20 +200,64 @@ def test_damaged_first_image_leaves_earlier_results_alone(run_kitti, kitti, fake
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
 
 
-def test_damaged_second_image_leaves_one_pose_and_no_old_numbers(run_kitti, kitti, fake, tmp_path):
+def test_one_frame_that_can_be_read_leaves_one_pose_and_no_old_numbers(run_kitti, kitti, fake, tmp_path):
     assert run_kitti().status == 0
-    truncate(kitti / "sequences" / "07" / "image_0" / "000001.png")
-    assert "1 pose before it" in run_kitti().error
+    for k in range(1, 6):
+        truncate(kitti / "sequences" / "07" / "image_0" / f"{k:06d}.png")
+    assert "1 pose kept" in run_kitti().error
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["frames"] == 1
     assert len(read_trajectory(tmp_path / "out" / "trajectory.txt")) == 1
     assert not (tmp_path / "out" / "trajectory.png").exists()
 
 
+def test_calibration_of_another_image_size(vojax_command, kitti, fake, tmp_path):
+    calibration = tmp_path / "camera.txt"
+    calibration.write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    (tmp_path / "cameras.txt").write_text(calibration.read_text())
+    error = vojax_command(
+        "run", kitti / "sequences" / "07" / "image_0", "--dataset", "images", "--pipeline", "mono-3d2d",
+        "--calibration", tmp_path / "cameras.txt", "--out", tmp_path / "out",
+    ).error  # fmt: skip
+    assert "32×16" in error
+    assert "640×480" in error
+
+
+@pytest.mark.parametrize(
+    ("dataset", "more", "said"),
+    [
+        ("kitti", ["--pipeline", "rgbd-3d2d"], "an image with its depth per frame, and the data set kitti has"),
+        ("tum", ["--pipeline", "stereo-3d2d"], "choose one of mono-2d2d, mono-3d2d, planar-1pt, rgbd-3d2d"),
+        ("images", ["--pipeline", "mono-3d2d"], "--dataset images needs --calibration FILE"),
+        ("euroc", ["--pipeline", "mono-3d2d", "--calibration", "x.yaml"], "expected none, as euroc has its own"),
+        ("tum", ["--pipeline", "mono-3d2d", "--camera-name", "cam0"], "expected --calibration with it"),
+        ("tum", ["--pipeline", "mono-3d2d", "--sequence", "desk"], "choose one of those there (poses, sequences)"),
+        ("tum", ["--pipeline", "mono-3d2d"], "does not tell which camera took it"),
+        ("tum", ["--pipeline", "mono-3d2d", "--sequence", "sequences"], "does not tell which camera took it"),
+        ("7scenes", ["--pipeline", "rgbd-3d2d"], "holds no colour images"),
+        ("euroc", ["--pipeline", "stereo-3d2d"], "expected a folder that holds mav0"),
+        ("images", ["--pipeline", "mono-3d2d", "--calibration", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_what_does_not_fit_together(vojax_command, kitti, fake, tmp_path, dataset, more, said):
+    error = vojax_command("run", kitti, "--dataset", dataset, *more, "--out", tmp_path / "out").error
+    assert said in error
+    assert fake.made == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_times_out_of_order(run_kitti, kitti, fake):
+    path = kitti / "sequences" / "07" / "times.txt"
+    path.write_text("0\n0.2\n0.1\n0.3\n0.4\n0.5\n")
+    error = run_kitti().error
+    assert "times.txt, line 3" in error
+    assert "order" in error or "increas" in error
+
+
 def test_a_pose_that_is_not_finite_is_never_written(run_kitti, fake, tmp_path, monkeypatch):
     good = fake.step
 
-    def step(self, left, right):
-        estimate = good(self, left, right)
+    def step(self, *images):
+        estimate = good(self, *images)
         pose = estimate.world_from_cam * (np.nan if len(self.images) == 5 else 1.0)
         return dataclasses.replace(estimate, world_from_cam=pose)
 

@@ -2,6 +2,7 @@ import io
 import json
 import pathlib
 import platform
+import signal
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ import vojax
 import vojax.datasets
 from vojax.cameras import Pinhole, RectifiedStereo
 from vojax.metrics import read_trajectory
+from vojax.odometry import Flag
 
 NAMES = {
     "ate_rmse_m", "alignment", "ate_rmse_se3_m", "ate_rmse_sim3_m", "drift_percent", "rpe_trans_m", "rpe_rot_deg",
@@ -32,7 +34,7 @@ def test_writes_trajectories_metrics_and_picture(run_kitti, fake, drawn_for_real
     assert outcome.stderr == ""
     (odometry,) = fake.made
     assert (odometry.seed, odometry.options.window) == (3, False)
-    assert float(odometry.stereo.baseline) == pytest.approx(0.5)
+    assert float(odometry.camera.baseline) == pytest.approx(0.5)
     assert [left.shape for left, _ in odometry.images] == [(16, 32)] * FRAMES
 
     metrics = read_metrics(tmp_path)
@@ -109,6 +111,93 @@ def test_bridged_frames_are_counted_and_said(run_kitti, fake, tmp_path):
     assert metrics["mean_inliers"] == pytest.approx((101 + 104 + 105) / 5)
 
 
+def test_flags_are_counted_and_said(run_kitti, fake, tmp_path):
+    fake.flagged = {2: (Flag.dark,), 3: (Flag.dark, Flag.overlap)}
+    outcome = run_kitti()
+    assert outcome.status == 0
+    assert "under-exposed in 2 frames: 2, 3" in outcome.stdout
+    assert "too little overlap with the frame before in 1 frame: 3" in outcome.stdout
+    assert read_metrics(tmp_path)["flags"] == {Flag.dark: 2, Flag.overlap: 1}
+
+
+def test_poses_found_later_are_written_in_their_place(run_kitti, fake, tmp_path, monkeypatch):
+    fake.pending, seen = (0, 1, 3, 5), []
+
+    def look(self, k):
+        path = tmp_path / "out" / "trajectory.txt"
+        seen.append(len(read_trajectory(path)) if path.exists() else 0)
+
+    monkeypatch.setattr(fake, "before", look)
+    outcome = run_kitti("--pipeline", "mono-3d2d")
+    assert outcome.status == 0
+    assert seen == [0, 0, 0, 3, 3, 5]
+    trajectory = read_trajectory(tmp_path / "out" / "trajectory.txt")
+    # The last frame's was never found.
+    np.testing.assert_allclose(trajectory.positions[:, 2], 1.01 * np.array([0, 1, 2, 3, 4, 4]), atol=1e-9)
+    np.testing.assert_allclose(trajectory.timestamps, 0.1 * np.arange(FRAMES), atol=1e-9)
+    assert "no motion was found for 1 frame; the pose before was repeated there: 5" in outcome.stdout
+    metrics = read_metrics(tmp_path)
+    assert (metrics["frames"], metrics["failures"], metrics["bridged_frames"]) == (FRAMES, 1, [5])
+    assert metrics["alignment"] == "sim3"
+    assert metrics["mean_inliers"] == pytest.approx((102 + 104) / 2)
+
+
+def test_a_path_that_never_began_is_no_motion(run_kitti, fake, tmp_path):
+    fake.pending = tuple(range(FRAMES))
+    outcome = run_kitti("--pipeline", "mono-3d2d")
+    assert outcome.status == 0
+    assert read_metrics(tmp_path)["failures"] == FRAMES
+    trajectory = read_trajectory(tmp_path / "out" / "trajectory.txt")
+    np.testing.assert_array_equal(trajectory.world_from_cam, np.tile(np.eye(4), (FRAMES, 1, 1)))
+
+
+def test_one_camera_reads_one_image(run_kitti, kitti, fake):
+    folder = kitti / "sequences" / "07"
+    (folder / "image_1").rename(folder / "elsewhere")
+    assert run_kitti("--pipeline", "mono-3d2d").status == 0
+    assert [len(images) for images in fake.made[0].images] == [1] * FRAMES
+    error = run_kitti().error
+    assert "monocular pipelines are mono-2d2d, mono-3d2d, planar-1pt" in error
+
+
+def test_stages_are_timed(run_kitti, fake, tmp_path):
+    assert run_kitti().status == 0
+    timings = read_metrics(tmp_path)["timings"]
+    assert timings.keys() == {"read", "step", "write", "frame"}
+    for stage in timings.values():
+        assert 0 <= stage["p50_ms"] <= stage["p90_ms"] <= stage["p99_ms"]
+    assert (tmp_path / "out" / "timings.png").read_text() == "read step write frame"
+
+
+def test_a_killed_run_leaves_whole_lines(kitti, tmp_path):
+    code = (
+        "import sys, time\n"
+        f"sys.path.insert(0, {str(pathlib.Path(__file__).parent)!r})\n"
+        "from conftest import FakeOdometry\n"
+        "from vojax.cli import main\n"
+        "from vojax.odometry import PIPELINES\n"
+        "class Slow(FakeOdometry):\n"
+        "    def before(self, k):\n"
+        "        if k == 4:\n"
+        "            print('four are done', flush=True)\n"
+        "            time.sleep(60)\n"
+        "PIPELINES['stereo-3d2d'] = PIPELINES['stereo-3d2d']._replace(odometry=Slow)\n"
+        "options = ['--dataset', 'kitti', '--pipeline', 'stereo-3d2d']\n"
+        f"main(['run', {str(kitti)!r}, *options, '--out', {str(tmp_path)!r}])\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "four are done" in line:
+            break
+    process.kill()
+    process.stdout.close()
+    assert process.wait(60) == -signal.SIGKILL
+    for format, name in (("tum", "trajectory.txt"), ("kitti", "trajectory_kitti.txt")):
+        trajectory = read_trajectory(tmp_path / name, format)
+        np.testing.assert_allclose(trajectory.positions[:, 2], 1.01 * np.arange(4), atol=1e-9)
+
+
 def test_max_frames_and_the_only_sequence(vojax_command, kitti, fake, tmp_path):
     outcome = vojax_command(
         "run", kitti, "--dataset", "kitti", "--pipeline", "stereo-3d2d", "--out", tmp_path / "out", "--max-frames", 4
@@ -134,6 +223,7 @@ def test_demo_draws_its_tracks_too(vojax_command, fake, drawn_for_real, tmp_path
             self.times = 0.1 * np.arange(frames)
             self.poses = np.tile(np.eye(4)[None, :3], (frames, 1, 1))
             self.poses[:, 2, 3] = np.arange(frames)
+            self.frame_names = [f"{k:06d}" for k in range(frames)]
             self.stereo = RectifiedStereo(Pinhole(fx=20.0, fy=20.0, cx=15.5, cy=7.5), baseline=0.5)
 
         def __len__(self):
@@ -149,7 +239,9 @@ def test_demo_draws_its_tracks_too(vojax_command, fake, drawn_for_real, tmp_path
     assert outcome.status == 0, outcome.stderr
     assert fake.made[0].seed == 2
     names = {path.name for path in (tmp_path / "deep" / "out").iterdir()}
-    assert names == {"trajectory.txt", "trajectory_kitti.txt", "metrics.json", "trajectory.png", "view.png"}
+    assert names == {
+        "trajectory.txt", "trajectory_kitti.txt", "metrics.json", "trajectory.png", "timings.png", "view.png",
+    }  # fmt: skip
     ((image, start, end),) = drawn
     assert image[0, 0] == 2  # the middle frame
     np.testing.assert_allclose(end - start, 1.0)
@@ -187,7 +279,7 @@ def test_version(vojax_command):
     assert (outcome.status, outcome.stdout) == (0, f"vojax {vojax.__version__}\n")
 
 
-@pytest.mark.parametrize("command", ["demo", "run", "eval"])
+@pytest.mark.parametrize("command", ["demo", "run", "compare", "eval"])
 def test_help_of_a_command(vojax_command, command):
     outcome = vojax_command(command, "--help")
     assert outcome.status == 0

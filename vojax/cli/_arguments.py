@@ -14,10 +14,12 @@ _DESCRIPTION = "Visual odometry in JAX. `vojax COMMAND --help` explains a comman
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Estimate the path of a stereo camera through a street that vojax renders itself."""
+    """Estimate the path of a camera through a street that vojax renders itself."""
 
     out: pathlib.Path = pathlib.Path("vojax-demo")
     """Folder for the results; made where it does not exist."""
+    pipeline: Annotated[str, tyro.conf.arg(metavar="NAME")] = "stereo-3d2d"
+    """How to estimate; an unknown name lists them all."""
     frames: Annotated[int, tyro.conf.arg(metavar="N")] = 48
     """Length of the sequence."""
     window: bool = True
@@ -31,21 +33,53 @@ class Run:
     """Estimate the path of a camera from a recorded sequence, and compare it with the truth where that is known."""
 
     path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Folder of the data set."""
-    dataset: Literal["kitti"]
+    """Folder of the data set; for images a folder of them, or a video file."""
+    dataset: Literal["kitti", "tum", "euroc", "7scenes", "images"]
     """Layout of that folder."""
     pipeline: Annotated[str, tyro.conf.arg(metavar="NAME")]
-    """How to estimate: stereo-3d2d."""
+    """How to estimate, such as stereo-3d2d; an unknown name lists them all."""
     out: pathlib.Path
     """Folder for the results; made where it does not exist."""
     sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Sequence of the data set, such as 06."""
+    """Of KITTI the sequence, such as 06; elsewhere a folder inside PATH."""
+    calibration: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
+    camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Which camera of that file; needed where it has several."""
     window: bool = True
     """Adjust the last keyframes together."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Stop after this many frames."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the random sampling; the same seed and images give the same path."""
+    rerun: Annotated[tuple[pathlib.Path, ...] | None, tyro.conf.arg(metavar="[FILE.rrd]")] = None
+    """Show the run in the rerun viewer, or record it into a file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """Run several pipelines on a recorded sequence, one after the other, and put their numbers into one table."""
+
+    path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Folder of the data set; for images a folder of them, or a video file."""
+    dataset: Literal["kitti", "tum", "euroc", "7scenes", "images"]
+    """Layout of that folder."""
+    pipelines: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
+    """Which pipelines, such as mono-3d2d stereo-3d2d; an unknown name lists them all."""
+    out: pathlib.Path
+    """Folder for the table; the results of each pipeline are in a folder of its name inside."""
+    sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Of KITTI the sequence, such as 06; elsewhere a folder inside PATH."""
+    calibration: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
+    camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    """Which camera of that file; needed where it has several."""
+    window: bool = True
+    """Adjust the last keyframes together."""
+    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Stop after this many frames."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Of the random sampling; the same seed and images give the same paths."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,11 +160,12 @@ class Help:
     """The user asked for help and has read it."""
 
 
-Command = Demo | Run | Eval | Ba | Calibrate | Bench
-_COMMANDS = ("demo", "run", "eval", "ba", "calibrate", "bench")
+Command = Demo | Run | Compare | Eval | Ba | Calibrate | Bench
+_COMMANDS = ("demo", "run", "compare", "eval", "ba", "calibrate", "bench")
 _Choice = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Ba, tyro.conf.subcommand("ba")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
@@ -201,7 +236,8 @@ def _one_line(box: str) -> str:
     for pattern, plain in _PLAIN:
         message = re.sub(pattern, plain, message)
     if names:
-        message = f"{message}: {', '.join(names)}"
+        # A choice that ends with a comma goes on in the next line.
+        message = f"{message}: {', '.join(names).replace(',, ', ',')}"
     for section in sections[1:]:
         if section and section[0].startswith("Perhaps you meant"):
             close = [line.strip() for line in section[1:] if re.match(r" {4}\S", line)]

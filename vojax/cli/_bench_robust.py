@@ -18,8 +18,6 @@ from vojax.cameras import Pinhole, Rig
 from vojax.datasets import simulate_absolute_pose, simulate_relative_pose, simulate_rigid
 from vojax.lie import SE3
 
-CAMERA = Pinhole(fx=800.0, fy=800.0, cx=639.5, cy=479.5)
-SIDE_BY_SIDE = SE3(jnp.array([[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, -0.5, 0, 0]]))
 SHARES = (0.3, 0.5, 0.7)
 _POINTS = 200
 _REPEATS = 20
@@ -89,14 +87,15 @@ class Estimator(NamedTuple):
 
 def estimators() -> dict[str, Estimator]:
     """All robust estimators."""
-    rig = Rig((CAMERA, CAMERA), SIDE_BY_SIDE)
+    camera = Pinhole(fx=800.0, fy=800.0, cx=639.5, cy=479.5)
+    rig = Rig((camera, camera), SE3(jnp.array([[1.0, 0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, -0.5, 0, 0]])))
     return {
-        "absolute_pose": Estimator(lambda x, u, key: robust.estimate_absolute_pose(x, u, CAMERA, key=key), _absolute),
+        "absolute_pose": Estimator(lambda x, u, key: robust.estimate_absolute_pose(x, u, camera, key=key), _absolute),
         "generalized_pose": Estimator(
             lambda x, u, index, key: robust.estimate_generalized_pose(x, u, index, rig, key=key), _rig
         ),
         "relative_pose": Estimator(
-            lambda u, v, key: robust.estimate_relative_pose(u, v, CAMERA, CAMERA, key=key), _two_views
+            lambda u, v, key: robust.estimate_relative_pose(u, v, camera, camera, key=key), _two_views
         ),
         "fundamental": Estimator(lambda u, v, key: robust.estimate_fundamental(u, v, key=key), _two_views),
         "homography": Estimator(lambda u, v, key: robust.estimate_homography(u, v, key=key), _plane),

@@ -5,11 +5,19 @@ from ._run_command import warn_without_cache
 
 
 def execute(command: Demo) -> None:
-    """Render the sequence and run the stereo pipeline on it."""
+    """Render the sequence and run the pipeline on it."""
     warn_without_cache()
     from vojax.datasets import SyntheticStereoSequence
 
+    from ._open_sequence import find_pipeline
     from ._run import run_sequence
 
-    sequence = SyntheticStereoSequence(frames=command.frames, seed=command.seed)
-    run_sequence(sequence, command.out, window=command.window, seed=command.seed, view_frame=command.frames // 2)
+    find_pipeline(command.pipeline)  # before the street is made
+    run_sequence(
+        SyntheticStereoSequence(frames=command.frames, seed=command.seed),
+        command.out,
+        pipeline=command.pipeline,
+        window=command.window,
+        seed=command.seed,
+        view_frame=command.frames // 2,
+    )

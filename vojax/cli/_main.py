@@ -49,7 +49,7 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"vojax {__version__}")
         return 0
-    from ._arguments import Ba, Bench, Calibrate, Demo, Eval, Help, Run, parse
+    from ._arguments import Ba, Bench, Calibrate, Compare, Demo, Eval, Help, Run, parse
 
     command = parse(arguments)
     if isinstance(command, Help):
@@ -58,6 +58,7 @@ def _dispatch(arguments: list[str]) -> int:
     modules = {
         Demo: "_demo_command",
         Run: "_run_command",
+        Compare: "_compare_command",
         Eval: "_eval_command",
         Ba: "_ba_command",
         Calibrate: "_calibrate_command",

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -58,6 +58,16 @@ def print_metrics(console: Console, title: str, metrics: Mapping[str, Any], by_n
 def print_line(console: Console, text: str) -> None:
     """Print a sentence as it is: paths are neither wrapped nor coloured."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def count(number: int, noun: str) -> str:
+    """A number of things, in words: 1 frame, 2 frames."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def some_frames(frames: Sequence[int]) -> str:
+    """The first of some frames, by their numbers."""
+    return ", ".join(map(str, frames[:12])) + (", …" if len(frames) > 12 else "")
 
 
 def write_json(path: pathlib.Path, values: Mapping[str, Any]) -> None:

@@ -1,6 +1,6 @@
 """`vojax run`: a recorded sequence."""
 
-import pathlib
+import contextlib
 import sys
 
 from ._arguments import Run
@@ -10,20 +10,39 @@ from ._compilation_cache import enable_compilation_cache
 def execute(command: Run) -> None:
     """Open the sequence and run the pipeline on it."""
     warn_without_cache()
-    from vojax.datasets import KittiSequence
-
+    from ._open_sequence import open_source
     from ._run import run_sequence
 
-    name = command.sequence if command.sequence is not None else _only_sequence(command.path)
-    sequence = KittiSequence(command.path, name)
-    run_sequence(
-        sequence,
-        command.out,
-        pipeline=command.pipeline,
-        window=command.window,
-        seed=command.seed,
-        max_frames=command.max_frames,
+    if command.rerun is not None and len(command.rerun) > 1:
+        files = " ".join(map(str, command.rerun))
+        raise ValueError(f"--rerun: found {files}, expected one file or none")
+    source = open_source(
+        command.dataset,
+        command.path,
+        command.pipeline,
+        sequence=command.sequence,
+        calibration=command.calibration,
+        camera_name=command.camera_name,
     )
+    with contextlib.ExitStack() as stack:
+        viewer = None
+        if command.rerun is not None:
+            from ._rerun import RerunViewer
+
+            viewer = stack.enter_context(RerunViewer(source, command.rerun[0] if command.rerun else None))
+        metrics = run_sequence(
+            source,
+            command.out,
+            pipeline=command.pipeline,
+            window=command.window,
+            seed=command.seed,
+            max_frames=command.max_frames,
+            viewer=viewer,
+        )
+    if metrics["error"] is not None:
+        from ._report import count
+
+        raise ValueError(f"{metrics['error']}; {count(metrics['frames'], 'pose')} kept in {command.out}")
 
 
 def warn_without_cache() -> None:
@@ -31,12 +50,3 @@ def warn_without_cache() -> None:
     problem = enable_compilation_cache()
     if problem is not None:
         print(f"vojax: warning: {' '.join(problem.split())}", file=sys.stderr)
-
-
-def _only_sequence(root: pathlib.Path) -> str:
-    """The sequence that is meant when none is named: the only one."""
-    folder = root / "sequences"
-    names = sorted(path.name for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
-    if len(names) > 1:
-        raise ValueError(f"{folder} holds {len(names)} sequences; choose one with --sequence: {', '.join(names)}")
-    return names[0] if names else "00"

@@ -1,8 +1,11 @@
 """Clocks of a run: since the process started, per frame, and how much of it was compilation."""
 
+import contextlib
+import math
 import os
 import sys
 import time
+from collections.abc import Iterator
 
 _IMPORTED = time.perf_counter()
 _COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -40,7 +43,7 @@ def peak_memory_mb() -> float | None:
 
 
 class FrameClock:
-    """Wall-clock time of each turn of a loop, and whether JAX compiled something in it.
+    """Wall-clock time of each turn of a loop and of its stages, and whether JAX compiled something in it.
 
     A program that comes out of the persistent cache counts as compiled too. Both threads count: reading ahead may
     compile as well. Use as a context around the loop.
@@ -52,6 +55,8 @@ class FrameClock:
         self._programs = 0
         self._programs_before = 0
         self._last = 0.0
+        self._stages: dict[str, list[float]] = {}
+        self._turn: dict[str, float] = {}
 
     def __enter__(self) -> "FrameClock":
         import jax
@@ -68,9 +73,25 @@ class FrameClock:
     def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         self._programs += event == _COMPILED
 
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count what happens inside as a stage of this turn."""
+        started = time.perf_counter()
+        yield
+        self.add(name, time.perf_counter() - started)
+
+    def add(self, stage: str, seconds: float) -> None:
+        """Count time that was taken elsewhere, such as in another thread, as a stage of this turn."""
+        self._turn[stage] = self._turn.get(stage, 0.0) + seconds
+
     def tick(self) -> None:
         """End a turn of the loop, and begin the next."""
         now, programs = time.perf_counter(), self._programs
+        for name in self._turn:
+            self._stages.setdefault(name, [0.0] * len(self._seconds))
+        for name, seconds in self._stages.items():
+            seconds.append(self._turn.get(name, 0.0))
+        self._turn = {}
         self._seconds.append(now - self._last)
         self._compiling.append(programs > self._programs_before)
         self._last, self._programs_before = now, programs
@@ -103,6 +124,14 @@ class FrameClock:
         usual = sum(steady) / len(steady) if steady else 0.0
         extra = [s - usual for s, compiling in zip(self._seconds, self._compiling, strict=True) if compiling]
         return max(0.0, sum(extra))
+
+    @property
+    def stages(self) -> dict[str, list[float]]:
+        """Seconds of each stage, and of the whole as "frame", by turn; NaN in turns with compilation."""
+        return {
+            name: [math.nan if compiling else s for s, compiling in zip(seconds, self._compiling, strict=True)]
+            for name, seconds in {**self._stages, "frame": self._seconds}.items()
+        }
 
     def _steady(self) -> list[float]:
         return [s for s, compiling in zip(self._seconds, self._compiling, strict=True) if not compiling]

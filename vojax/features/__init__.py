@@ -5,6 +5,7 @@ from ._detect import Keypoints as Keypoints
 from ._detect import detect as detect
 from ._image import read_image as read_image
 from ._image import to_gray as to_gray
+from ._rectify import remap as remap
 from ._stereo import StereoMatches as StereoMatches
 from ._stereo import StereoOptions as StereoOptions
 from ._stereo import match_stereo_rows as match_stereo_rows

@@ -44,6 +44,30 @@ class MotionOptions:
     ransac: RansacOptions = RansacOptions(threshold_px=2.0, max_hypotheses=1024, chunk_size=128)
 
 
+@dataclasses.dataclass(frozen=True)
+class RigidMotionOptions:
+    """Noise and thresholds of the motion between two frames, each triangulated by itself.
+
+    Attributes:
+        sigma_track_px: Standard deviation of a tracked position.
+        sigma_detect_px: Standard deviation of the position that a track starts the frame from.
+        max_depth_error: Largest relative standard deviation of a depth, σ_d/d. At a tenth the next term of its
+            expansion is a tenth of the first: the noise still counts as Gaussian, its bias of a hundredth is taken out.
+        search_depth_error: The same for points that make hypotheses.
+        max_mahalanobis: Largest whitened residual of an inlier, standard deviations.
+        self_calibrate: Estimate the disparity error that rectification left (`DisparityCalibration`).
+        ransac: The search; its thresholds are not read.
+    """
+
+    sigma_track_px: float = 0.25
+    sigma_detect_px: float = 0.1
+    max_depth_error: float = 0.1
+    search_depth_error: float = 0.02
+    max_mahalanobis: float = 4.0
+    self_calibrate: bool = True
+    ransac: RansacOptions = RansacOptions(max_hypotheses=2048, chunk_size=512)
+
+
 class StereoFeatures(eqx.Module):
     """Padded stereo measurements of one frame.
 
@@ -68,8 +92,8 @@ class Motion(eqx.Module):
         covariance: Of its camera-frame tangent.
         inliers: Features that agree.
         num_inliers: How many.
+        num_usable: Features that could have agreed.
         depths: Of the features in the new frame, metres.
-        predicted: Pixels of the features in the frame after, should the motion repeat itself.
         calibration: With this frame's evidence.
     """
 
@@ -77,12 +101,12 @@ class Motion(eqx.Module):
     covariance: Float[Array, "6 6"]
     inliers: Bool[Array, " n"]
     num_inliers: Int[Array, ""]
+    num_usable: Int[Array, ""]
     depths: Float[Array, " n"]
-    predicted: Float[Array, "n 2"]
     calibration: DisparityCalibration
 
 
-# Matches the standard deviation of a disparity that was not measured: finite, and without influence.
+# Standard deviation of a disparity that was not measured: finite, and without influence.
 _UNKNOWN_PX = 100.0
 
 
@@ -134,34 +158,16 @@ def stereo_motion(
     found = jnp.sum(consensus.inliers) > 3
     pose = SE3(jnp.where(found, rough.wxyz_xyz, guess.wxyz_xyz))
 
-    sigma1 = jnp.where(features1.has_disparity, features1.sigma_disparity, _UNKNOWN_PX)
-    noise0 = measurement_covariance(options.sigma_detect_px, features0.sigma_disparity)
-    noise1 = measurement_covariance(options.sigma_track_px, sigma1)
-
-    def predict(pose: SE3, measurement: Float[Array, "3"]) -> Float[Array, "3"]:
-        return stereo.project(pose.apply(stereo.unproject(measurement)))
-
-    def observed(pose: SE3) -> Array:
-        """Measurements at k; where the right image has no match, the prediction stands in for it."""
-        expected = jax.vmap(lambda m: predict(pose, m))(first)
-        disparity = expected[:, 0] - expected[:, 2]
-        right = jnp.where(features1.has_disparity, second[:, 2], second[:, 0] - disparity)
-        return jnp.stack([second[:, 0], second[:, 1], right], axis=1)
-
-    def covariances(pose: SE3) -> tuple[Array, Array]:
-        jacobian = jax.vmap(jax.jacfwd(lambda m: predict(pose, m)))(first)
-        carried = jnp.sum(jacobian[:, :, :, None] * noise0[:, None], axis=2)
-        carried = jnp.sum(carried[:, :, None, :] * jacobian[:, None, :, :], axis=3)
-        return noise1 + carried, jacobian
+    residuals = TransferResiduals(first, second, features0, features1, options, stereo)
 
     def refine(pose: SE3, _: None) -> tuple[SE3, Array]:
         in_front = pose.apply(points0)[:, 2] > 0
         refined = refine_absolute_pose(
             pose,
             points0,
-            observed(pose),
+            residuals.observed(pose),
             stereo,
-            sigma_px=covariances(pose)[0],
+            sigma_px=residuals.covariances(pose)[0],
             mask=usable & in_front,
             loss=GemanMcClure(2.0),
             options=LMOptions(max_steps=10),
@@ -170,44 +176,113 @@ def stereo_motion(
 
     # The covariances depend on the pose a little: twice is enough.
     pose, all_covariances = jax.lax.scan(refine, pose, None, length=2)
+    return residuals.conclude(pose, all_covariances[-1], usable, found, calibration, offsets)
 
-    covariance, carried = covariances(pose)
-    information = jnp.moveaxis(symmetric_inverse(jnp.moveaxis(covariance, 0, -1))[0], -1, 0)
-    residual = jax.vmap(lambda m: predict(pose, m))(first) - observed(pose)
-    squared = jnp.sum(jnp.sum(information * residual[:, None, :], axis=2) * residual, axis=1)
-    points1 = pose.apply(points0)
-    inliers = usable & found & (squared < options.max_mahalanobis**2) & (points1[:, 2] > 0)
 
-    updated = calibration
-    if options.self_calibrate:
-        weight = jnp.where(inliers, GemanMcClure(2.0).weight(squared), 0.0)
-        projection = jax.vmap(jax.jacfwd(stereo.project))(points1)  # [n, 3, 3]
-        by_rotation = jnp.cross(projection, points1[:, None, :])
-        terms0 = jnp.stack(disparity_terms(first[:, 0], stereo), axis=1)
-        terms1 = jnp.stack(disparity_terms(second[:, 0], stereo), axis=1)
-        # Offsets move u_right: down in the first frame, and where there is a match in the second.
-        by_offsets = -carried[:, :, 2, None] * terms0[:, None, :]
-        measured = features1.has_disparity.astype(first.dtype)[:, None] * terms1
-        by_offsets = by_offsets.at[:, 2].add(measured)
-        jacobian = jnp.concatenate([-projection, by_rotation, by_offsets], axis=2)  # [n, 3, 8]
-        weighted = weight[:, None, None] * jnp.sum(information[:, :, :, None] * jacobian[:, None], axis=2)
-        jacobian, weighted = jacobian.reshape(-1, 8), weighted.reshape(-1, 8)
-        hessian = jnp.matmul(jacobian.T, weighted, precision="highest")
-        gradient = jnp.sum(weighted * residual.reshape(-1, 1), axis=0)
-        updated = calibration.add(hessian, gradient, offsets)
+class TransferResiduals(eqx.Module):
+    """Measurements of one frame carried into the next, against what was measured there.
 
-    points = stereo.unproject(second)
-    depths = jnp.where(features1.has_disparity, points[:, 2], points1[:, 2])
-    return Motion(
-        pose,
-        all_covariances[-1],
-        inliers,
-        jnp.sum(inliers),
-        depths,
-        jnp.where(
-            (features1.has_disparity & (points[:, 2] > 0))[:, None],
-            stereo.camera.project(pose.apply(points)),
-            second[:, :2],
-        ),
-        updated,
-    )
+    Attributes:
+        first: Of the first frame, the disparity error taken out.
+        second: Of the second.
+        features0: Their noise, and which there are.
+        features1: The same of the second.
+        options: Noise and thresholds.
+        stereo: The rig.
+    """
+
+    first: Float[Array, "n 3"]
+    second: Float[Array, "n 3"]
+    features0: StereoFeatures
+    features1: StereoFeatures
+    options: MotionOptions | RigidMotionOptions = eqx.field(static=True)
+    stereo: RectifiedStereo
+
+    def noise(self) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
+        """Covariances of the measurements of both frames."""
+        sigma1 = jnp.where(self.features1.has_disparity, self.features1.sigma_disparity, _UNKNOWN_PX)
+        return (
+            measurement_covariance(self.options.sigma_detect_px, self.features0.sigma_disparity),
+            measurement_covariance(self.options.sigma_track_px, sigma1),
+        )
+
+    def predict(self, pose: SE3, measurement: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Carry one measurement into the second frame."""
+        return self.stereo.project(pose.apply(self.stereo.unproject(measurement)))
+
+    def observed(self, pose: SE3) -> Float[Array, "n 3"]:
+        """Measurements at k; where the right image has no match, the prediction stands in for it."""
+        expected = jax.vmap(lambda m: self.predict(pose, m))(self.first)
+        disparity = expected[:, 0] - expected[:, 2]
+        right = jnp.where(self.features1.has_disparity, self.second[:, 2], self.second[:, 0] - disparity)
+        return jnp.stack([self.second[:, 0], self.second[:, 1], right], axis=1)
+
+    def covariances(self, pose: SE3) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3 3"]]:
+        """Of the residuals, Σ_k + J Σ_{k−1} Jᵀ; and J."""
+        noise0, noise1 = self.noise()
+        jacobian = jax.vmap(jax.jacfwd(lambda m: self.predict(pose, m)))(self.first)
+        carried = jnp.sum(jacobian[:, :, :, None] * noise0[:, None], axis=2)
+        carried = jnp.sum(carried[:, :, None, :] * jacobian[:, None, :, :], axis=3)
+        return noise1 + carried, jacobian
+
+    def conclude(
+        self,
+        pose: SE3,
+        pose_covariance: Float[Array, "6 6"],
+        usable: Bool[Array, " n"],
+        found: Bool[Array, ""],
+        calibration: DisparityCalibration,
+        offsets: Float[Array, "2"],
+    ) -> Motion:
+        """Tell inliers from outliers at the final pose, and what they say of the disparity error.
+
+        Args:
+            pose: `cam1_from_cam0`.
+            pose_covariance: Its covariance.
+            usable: Features that can agree.
+            found: False where the search failed.
+            calibration: Disparity error known so far.
+            offsets: What has been taken out of the measurements.
+        """
+        stereo, first, second = self.stereo, self.first, self.second
+        matched = self.features1.has_disparity
+        covariance, carried = self.covariances(pose)
+        information = jnp.moveaxis(symmetric_inverse(jnp.moveaxis(covariance, 0, -1))[0], -1, 0)
+        residual = jax.vmap(lambda m: self.predict(pose, m))(first) - self.observed(pose)
+        squared = jnp.sum(jnp.sum(information * residual[:, None, :], axis=2) * residual, axis=1)
+        points1 = pose.apply(stereo.unproject(first))
+        inliers = usable & found & (squared < self.options.max_mahalanobis**2) & (points1[:, 2] > 0)
+
+        if self.options.self_calibrate:
+            weight = jnp.where(inliers, GemanMcClure(2.0).weight(squared), 0.0)
+            projection = jax.vmap(jax.jacfwd(stereo.project))(points1)  # [n, 3, 3]
+            by_rotation = jnp.cross(projection, points1[:, None, :])
+            terms0 = jnp.stack(disparity_terms(first[:, 0], stereo), axis=1)
+            terms1 = jnp.stack(disparity_terms(second[:, 0], stereo), axis=1)
+            # Offsets move u_right: down in the first frame, and where there is a match in the second.
+            by_offsets = -carried[:, :, 2, None] * terms0[:, None, :]
+            by_offsets = by_offsets.at[:, 2].add(matched.astype(first.dtype)[:, None] * terms1)
+            jacobian = jnp.concatenate([-projection, by_rotation, by_offsets], axis=2)  # [n, 3, 8]
+            weighted = weight[:, None, None] * jnp.sum(information[:, :, :, None] * jacobian[:, None], axis=2)
+            jacobian, weighted = jacobian.reshape(-1, 8), weighted.reshape(-1, 8)
+            hessian = jnp.matmul(jacobian.T, weighted, precision="highest")
+            gradient = jnp.sum(weighted * residual.reshape(-1, 1), axis=0)
+            calibration = calibration.add(hessian, gradient, offsets)
+
+        depths = jnp.where(matched, stereo.unproject(second)[:, 2], points1[:, 2])
+        return Motion(pose, pose_covariance, inliers, jnp.sum(inliers), jnp.sum(usable), depths, calibration)
+
+
+@eqx.filter_jit
+def predicted_pixels(features: StereoFeatures, cam1_from_cam0: SE3, stereo: RectifiedStereo) -> Float[Array, "n 2"]:
+    """Where a motion would put the features; those without a disparity stay where they are.
+
+    Args:
+        features: Of the first frame.
+        cam1_from_cam0: The motion expected.
+        stereo: The rig.
+    """
+    points = cam1_from_cam0.apply(stereo.unproject(features.measurements))
+    known = features.has_disparity & (points[:, 2] > 0)
+    points = jnp.where(known[:, None], points, jnp.array([0.0, 0.0, 1.0])[None])
+    return jnp.where(known[:, None], stereo.camera.project(points), features.measurements[:, :2])

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from ._mono import MonoOdometry, MonoOdometryOptions
+from ._motion import RigidMotionOptions
+from ._rgbd import RgbdOdometry, RgbdOdometryOptions
 from ._stereo import StereoOdometry, StereoOdometryOptions
 
 
@@ -37,4 +39,8 @@ PIPELINES: dict[str, Pipeline] = {
     "mono-3d2d": _mono("absolute"),
     "planar-1pt": _mono("planar"),
     "stereo-3d2d": Pipeline(StereoOdometry, StereoOdometryOptions, "pair"),
+    "stereo-3d3d": Pipeline(
+        StereoOdometry, functools.partial(StereoOdometryOptions, motion=RigidMotionOptions()), "pair"
+    ),
+    "rgbd-3d2d": Pipeline(RgbdOdometry, RgbdOdometryOptions, "depth"),
 }

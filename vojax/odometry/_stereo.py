@@ -1,35 +1,24 @@
-"""Stereo 3-D-to-2-D odometry, frame by frame.
+"""Stereo odometry, frame by frame.
 
-Scaramuzza & Fraundorfer 2011, algorithm "VO from 3-D-to-2-D correspondences", with stereo instead of two views: track
-features from k−1 to k, triangulate them at k−1 from the stereo pair, solve the pose at k, chain C_k = C_{k−1} T_k, and
-adjust the last keyframes together.
+Scaramuzza & Fraundorfer 2011, algorithms "VO from 3-D-to-2-D correspondences" and "VO from 3-D-to-3-D correspondences",
+with stereo instead of two views: track features from k−1 to k, triangulate them from the stereo pair at k−1 (and, for
+the second, at k), solve the pose at k, chain C_k = C_{k−1} T_k, and adjust the last keyframes together.
 """
 
 import dataclasses
-from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vojax.cameras import RectifiedStereo
-from vojax.features import (
-    DetectorOptions,
-    StereoMatches,
-    StereoOptions,
-    TrackerOptions,
-    detect,
-    match_stereo_rows,
-    to_gray,
-    track,
-)
-from vojax.lie import SE3
+from vojax.features import DetectorOptions, StereoOptions, TrackerOptions, match_stereo_rows, to_gray
 
+from ._disparity_odometry import DisparityOdometry, Measured
 from ._frame import FrameEstimate
-from ._keyframes import KeyframeOptions, is_keyframe
-from ._motion import Motion, MotionOptions, StereoFeatures, stereo_motion
-from ._rectification import DisparityCalibration
-from ._sliding_window import Keyframe, SlidingWindow, WindowOptions, orthonormal
+from ._image_checks import ImageChecks
+from ._keyframes import KeyframeOptions
+from ._motion import MotionOptions, RigidMotionOptions
+from ._pair_rectifier import PairRectifier
+from ._sliding_window import WindowOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +31,9 @@ class StereoOdometryOptions:
         detector: Corners.
         tracker: From frame to frame.
         matcher: From left to right.
-        motion: Pose of the new frame.
+        motion: Pose of the new frame: from points to pixels (`MotionOptions`, 3-D-to-2-D) or from points to points
+            (`RigidMotionOptions`, 3-D-to-3-D).
+        checks: When a frame is flagged.
         keyframes: Which frames enter the window.
         sliding_window: The window.
     """
@@ -52,26 +43,17 @@ class StereoOdometryOptions:
     detector: DetectorOptions = DetectorOptions(max_features=600)
     tracker: TrackerOptions = TrackerOptions()
     matcher: StereoOptions = StereoOptions()
-    motion: MotionOptions = MotionOptions()
+    motion: MotionOptions | RigidMotionOptions = MotionOptions()
+    checks: ImageChecks = ImageChecks()
     keyframes: KeyframeOptions = KeyframeOptions()
     sliding_window: WindowOptions = WindowOptions()
 
 
-class _Frame(NamedTuple):
-    """Features of a frame, in the order of its arrays."""
-
-    image: np.ndarray
-    ids: np.ndarray
-    pixels: np.ndarray
-    stereo: StereoMatches
-    predicted: np.ndarray  # pixels in the next frame
-
-
 class StereoOdometry:
-    """Estimates the path of a rectified stereo camera from its images.
+    """Estimates the path of a stereo camera from its images.
 
     Args:
-        stereo: The calibrated rig.
+        stereo: The rig: a rectified pair, or the `PairRectifier` of any other.
         options: Stages and their settings.
         seed: Of the random sampling; the same seed and images give the same path.
 
@@ -84,134 +66,61 @@ class StereoOdometry:
     """
 
     def __init__(
-        self, stereo: RectifiedStereo, options: StereoOdometryOptions = StereoOdometryOptions(), *, seed: int = 0
+        self,
+        stereo: RectifiedStereo | PairRectifier,
+        options: StereoOdometryOptions = StereoOdometryOptions(),
+        *,
+        seed: int = 0,
     ):
-        self._stereo = stereo
         self._options = options
-        self._key = jax.random.key(seed)
-        self._calibration = DisparityCalibration.prior()
-        self._window = SlidingWindow(stereo, options.sliding_window)
-        self._frame: _Frame | None = None
-        self._pose = np.eye(4)
-        self._motion = SE3.identity()  # cam1_from_cam0 of the last frame
-        self._next_id = 0
-        self._count = 0
+        self._rectifier = stereo if isinstance(stereo, PairRectifier) else None
+        rectified = stereo.stereo if isinstance(stereo, PairRectifier) else stereo
+        self._odometry = DisparityOdometry(rectified, options, seed=seed)
 
     @property
     def disparity_offsets_px(self) -> np.ndarray:
         """The disparity error (a₀, a₁) estimated so far; see `DisparityCalibration`."""
-        return np.asarray(self._calibration.estimate())
+        return np.asarray(self._odometry.calibration.estimate())
 
     def step(self, left: np.ndarray, right: np.ndarray) -> FrameEstimate:
         """Take the next stereo pair.
 
         Args:
-            left: uint8 image of the left camera, rectified.
+            left: uint8 image of the left camera; rectified, unless the odometry was made with a `PairRectifier`.
             right: Of the right one, of the same size.
 
         Returns:
-            The new pose and what it rests on.
+            The new pose of the left camera and what it rests on.
 
         Raises:
             ValueError: If the images do not fit together or to those before.
         """
-        left, right = to_gray(left), to_gray(right)
-        previous = self._frame
-        if previous is not None and left.shape != previous.image.shape:
-            raise ValueError(
-                f"image {self._count} is {left.shape[1]}×{left.shape[0]} px, the one before was "
-                f"{previous.image.shape[1]}×{previous.image.shape[0]}: a sequence has one size"
-            )
-        kept = np.zeros(0, int)
-        if previous is not None:
-            tracks = track(previous.image, left, previous.pixels, self._options.tracker, guess=previous.predicted)
-            kept = np.flatnonzero(tracks.valid)
-            carried, ids, quality = tracks.pixels[kept], previous.ids[kept], tracks.quality[kept]
-        else:
-            carried, ids, quality = np.zeros((0, 2), np.float32), np.zeros(0, int), np.zeros(0, np.float32)
-        fresh = detect(left, self._options.detector, existing=carried).pixels
-        fresh = fresh[: max(0, self._options.detector.max_features - len(carried))]
-        pixels = np.concatenate([carried, fresh])
-        ids = np.concatenate([ids, self._next_id + np.arange(len(fresh))])
-        self._next_id += len(fresh)
-        matches = match_stereo_rows(left, right, pixels, self._options.matcher)
-        frame = _Frame(left, ids, pixels, matches, pixels)
+        rectify = self._rectifier
+        left, right = (to_gray(left), to_gray(right)) if rectify is None else rectify(left, right)
 
-        if previous is None:
-            estimate = self._finish(frame, np.zeros(0, int), kept, None)
-        else:
-            motion = self._estimate(previous, frame, kept, quality)
-            inliers = np.flatnonzero(np.asarray(motion.inliers)[: len(kept)])
-            tracked = len(inliers) >= self._options.min_inliers
-            frame = frame._replace(predicted=np.asarray(motion.predicted)[: len(pixels)])
-            estimate = self._finish(frame, inliers, kept, motion if tracked else None)
-        self._count += 1
-        return estimate
+        def measure(pixels: np.ndarray) -> Measured:
+            return Measured(pixels, match_stereo_rows(left, right, pixels, self._options.matcher))
 
-    def _estimate(self, previous: _Frame, frame: _Frame, kept: np.ndarray, quality: np.ndarray) -> Motion:
-        size = -(-self._options.detector.max_features // 64) * 64
-        before = StereoMatches(*(field[kept] for field in previous.stereo))
-        return stereo_motion(
-            _padded(previous.pixels[kept], before, size),
-            _padded(frame.pixels, frame.stereo, size),
-            jnp.asarray(np.pad(quality, (0, size - len(quality)))),
-            self._motion,
-            self._calibration,
-            self._stereo,
-            jax.random.fold_in(self._key, self._count),
-            self._options.motion,
+        return self._as_taken(self._odometry.step(left, measure))
+
+    def skip(self) -> FrameEstimate:
+        """Bridge a pair that cannot be read: the last motion is repeated.
+
+        The next pair is tracked from the last one that could be read, so that its pose rests on no guess.
+
+        Returns:
+            The pose guessed, flagged `unreadable`.
+        """
+        return self._as_taken(self._odometry.skip())
+
+    def _as_taken(self, estimate: FrameEstimate) -> FrameEstimate:
+        """Pose and pixels of the left camera, where they are those of the rectified one."""
+        rectifier = self._rectifier
+        if rectifier is None:
+            return estimate
+        return dataclasses.replace(
+            estimate,
+            world_from_cam=rectifier.pose_of_left(estimate.world_from_cam),
+            pixels=rectifier.pixels_of_left(estimate.pixels),
+            previous_pixels=rectifier.pixels_of_left(estimate.previous_pixels),
         )
-
-    def _finish(self, frame: _Frame, inliers: np.ndarray, kept: np.ndarray, motion: Motion | None) -> FrameEstimate:
-        """Chain the motion, keep the books of the window and report."""
-        previous, bridged = self._frame, motion is None and self._frame is not None
-        if motion is not None:
-            self._motion, self._calibration = motion.cam1_from_cam0, motion.calibration
-        step = orthonormal(np.asarray(self._motion.inverse().as_matrix(), np.float64)) if previous else np.eye(4)
-        pose = orthonormal(self._pose @ step)
-        if bridged:
-            self._window.clear()
-        keyframe = self._is_keyframe(pose, frame, inliers, motion)
-        if keyframe:
-            # The first frame and one after a break have no inliers yet: everything they see may become a landmark.
-            rows = inliers if motion is not None else np.arange(0)
-            rows = np.concatenate([rows, np.arange(len(kept), len(frame.pixels))])
-            pose = self._window.add(
-                Keyframe(pose, frame.ids[rows], _measurements(frame.pixels, frame.stereo)[rows],
-                         np.where(frame.stereo.valid, frame.stereo.sigma, 0.0)[rows]),
-                self._calibration.estimate() if self._options.motion.self_calibrate else jnp.zeros(2),
-                adjust=self._options.window,
-            )  # fmt: skip
-        self._pose, self._frame = pose, frame
-        return FrameEstimate(
-            pose,
-            0 if bridged else len(inliers),
-            bridged,
-            keyframe,
-            frame.pixels[inliers],
-            previous.pixels[kept[inliers]] if previous else frame.pixels[inliers],
-            frame.stereo.disparity[inliers],
-        )
-
-    def _is_keyframe(self, pose: np.ndarray, frame: _Frame, inliers: np.ndarray, motion: Motion | None) -> bool:
-        newest = self._window.newest
-        if newest is None or motion is None:
-            return True
-        shared = len(np.intersect1d(newest.ids, frame.ids[inliers]))
-        distance = float(np.linalg.norm(pose[:3, 3] - newest.world_from_cam[:3, 3]))
-        return is_keyframe(distance, np.asarray(motion.depths)[inliers], shared, self._options.keyframes)
-
-
-def _measurements(pixels: np.ndarray, matches: StereoMatches) -> np.ndarray:
-    return np.column_stack([pixels, pixels[:, 0] - matches.disparity]).astype(np.float32)
-
-
-def _padded(pixels: np.ndarray, matches: StereoMatches, size: int) -> StereoFeatures:
-    n = len(pixels)
-    measurements = np.zeros((size, 3), np.float32)
-    measurements[:n] = _measurements(pixels, matches)
-    sigma = np.ones(size, np.float32)
-    sigma[:n] = matches.sigma
-    position, disparity = np.zeros(size, bool), np.zeros(size, bool)
-    position[:n], disparity[:n] = True, matches.valid
-    return StereoFeatures(*map(jnp.asarray, (measurements, sigma, position, disparity)))

@@ -15,6 +15,12 @@ BLUE = "#0072b2"
 ORANGE = "#d55e00"
 GREEN = "#009e73"
 TRUTH = "#9ca3af"
+_SERIES = (BLUE, ORANGE, GREEN, "#cc79a7", "#e69f00", "#56b4e9", INK)
+
+
+def series_colour(i: int) -> str:
+    """Colour of series `i`; they repeat after seven."""
+    return _SERIES[i % len(_SERIES)]
 
 
 def new_figure(width: float, height: float) -> "Figure":

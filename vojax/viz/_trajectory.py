@@ -1,12 +1,13 @@
 """A trajectory beside the truth: top view, and errors over time."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from vojax.metrics import AlignedPair, Trajectory, align
 
-from ._figure import BLUE, GREEN, INK, MUTED, ORANGE, TRUTH, new_figure, quiet_axes
+from ._figure import BLUE, GREEN, INK, MUTED, ORANGE, TRUTH, new_figure, quiet_axes, series_colour
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,6 +68,52 @@ def plot_trajectory(
     if title:
         figure.suptitle(title, color=INK, fontsize=13, fontweight="bold", x=0.01, ha="left")
     figure.supxlabel(note, color=MUTED, fontsize=9, x=0.01, ha="left")
+    return figure
+
+
+def plot_trajectories(
+    estimates: Mapping[str, Trajectory],
+    truth: Trajectory | None = None,
+    *,
+    plane: Plane = "xz",
+    title: str | None = None,
+) -> "Figure":
+    """Draw several trajectories from above, as they are.
+
+    Args:
+        estimates: Poses by a name for the legend, in the frame and scale of the truth; see `vojax.metrics.align`.
+        truth: True poses.
+        plane: As for `plot_trajectory`.
+        title: Headline.
+
+    Returns:
+        A matplotlib figure for `save_figure` or a notebook.
+
+    Raises:
+        ImportError: Matplotlib is not installed.
+        ValueError: There is no trajectory, or the plane is not known.
+    """
+    if plane not in ("xz", "xy", "yz"):
+        raise ValueError(f"unknown plane {plane!r}; expected 'xz', 'xy' or 'yz'")
+    if not estimates:
+        raise ValueError("there are no trajectories: expected at least one")
+    h, v = ("xyz".index(letter) for letter in plane)
+    figure = new_figure(7.6, 5.6)
+    axes = figure.add_subplot()
+    quiet_axes(axes)
+    if truth is not None:
+        x, y = _broken(truth.timestamps, truth.positions[:, h], truth.positions[:, v])
+        axes.plot(x, y, color=TRUTH, linewidth=4.5, alpha=0.75, solid_capstyle="round", label="ground truth")
+    for i, (name, estimate) in enumerate(estimates.items()):
+        x, y = _broken(estimate.timestamps, estimate.positions[:, h], estimate.positions[:, v])
+        axes.plot(x, y, color=series_colour(i), linewidth=1.6, label=name)
+    everything = np.concatenate([one.positions for one in (*estimates.values(), *([truth] if truth else []))])
+    _frame(axes, everything[:, h], everything[:, v])
+    axes.set_xlabel(f"{plane[0]} [m]", color=INK)
+    axes.set_ylabel(f"{plane[1]} [m]", color=INK)
+    axes.legend(frameon=False, fontsize=9, labelcolor=INK, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    if title:
+        figure.suptitle(title, color=INK, fontsize=13, fontweight="bold", x=0.01, ha="left")
     return figure
 
 
