@@ -17,9 +17,9 @@ from vojax.odometry import MotionOptions, StereoOdometry, StereoOdometryOptions
 
 VARIANTS = {
     "default": StereoOdometryOptions(),
-    "without window": StereoOdometryOptions(window=False),
+    "with window": StereoOdometryOptions(window=True),
     "without self-calibration": StereoOdometryOptions(motion=MotionOptions(self_calibrate=False)),
-    "without either": StereoOdometryOptions(window=False, motion=MotionOptions(self_calibrate=False)),
+    "window, no calibration": StereoOdometryOptions(window=True, motion=MotionOptions(self_calibrate=False)),
 }
 
 

@@ -17,7 +17,7 @@ def compare(vojax_command, kitti, tmp_path):
 
 
 def test_one_table_of_several_pipelines(compare, fake, drawn_for_real, tmp_path):
-    outcome = compare("stereo-3d2d", "mono-3d2d", more=("--seed", 2, "--max-frames", 5, "--no-window"))
+    outcome = compare("stereo-3d2d", "mono-3d2d", more=("--seed", 2, "--max-frames", 5, "--window", "off"))
     assert outcome.status == 0, outcome.stderr
     assert [(made.seed, made.options.window) for made in fake.made] == [(2, False), (2, False)]
     written = json.loads((tmp_path / "out" / "compare.json").read_text())

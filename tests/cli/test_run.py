@@ -29,7 +29,7 @@ def read_metrics(tmp_path):
 
 
 def test_writes_trajectories_metrics_and_picture(run_kitti, fake, drawn_for_real, tmp_path):
-    outcome = run_kitti("--seed", 3, "--no-window")
+    outcome = run_kitti("--seed", 3, "--window", "off")
     assert outcome.status == 0
     assert outcome.stderr == ""
     (odometry,) = fake.made

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vojax.datasets import KittiSequence, SyntheticStereoSequence
+from vojax.datasets import KittiSequence, SyntheticStereoSequence, read_planar_tracks
 from vojax.features import DetectorOptions
 from vojax.lie import SE3
 from vojax.metrics import Trajectory, evaluate
@@ -267,6 +267,24 @@ def test_bootstrap_moves_on_where_the_first_view_is_lost(street):
     np.testing.assert_array_equal(start.poses[:2], np.tile(np.eye(4), (2, 1, 1)))
 
 
+def test_bootstrap_moves_on_where_a_small_first_view_has_too_few_left(street):
+    # Fifty features, of which 35 stay in view: no motion will ever be found with this one.
+    rng = np.random.default_rng(10)
+    bootstrap = Bootstrap(street.camera, BootstrapOptions(), SIZE, jax.random.key(3))
+    points = scene(rng)
+    start = None
+    for k in range(8):
+        place = pose((0, 0.3 * k, 0), (0.2 * k, 0, 0.5 * k))
+        found = features(*seen(street.camera, place, points, rng))
+        if k == 0:
+            found = found._replace(ids=np.where(np.arange(len(found.ids)) < 35, found.ids, found.ids + 10_000))
+            found = found._replace(ids=found.ids[:50], pixels=found.pixels[:50], quality=found.quality[:50])
+        start = bootstrap.add(found)
+        if start is not None:
+            break
+    assert start is not None
+
+
 # Images
 
 
@@ -335,6 +353,52 @@ def test_images_of_another_size_are_refused(street):
     odometry.step(street.images(0)[0])
     with pytest.raises(ValueError, match="a sequence has one size"):
         odometry.step(np.zeros((100, 100), np.uint8))
+
+
+@pytest.mark.parametrize("motion", ["absolute", "relative"])
+def test_tracks_of_another_front_end_are_followed(street, motion):
+    rng = np.random.default_rng(11)
+    points = rng.uniform([-15.0, -6.0, 4.0], [15.0, 3.0, 60.0], (1200, 3))
+    points = points @ street.poses[0, :, :3].T + street.poses[0, :, 3]
+    odometry = MonoOdometry(street.camera, MonoOdometryOptions(motion=motion, detector=DETECTOR))
+    poses = []
+    for k in range(16):
+        place = np.eye(4)
+        place[:3] = street.poses[k]
+        pixels, visible = seen(street.camera, place, points, rng, 0.1)
+        rows = rng.permutation(np.flatnonzero(visible))[:SIZE]
+        estimate = odometry.step_tracks(rows, pixels[rows])
+        assert not estimate.bridged
+        if not estimate.pending:
+            poses += [*estimate.earlier, estimate.world_from_cam]
+    metrics = measure(street, np.stack(poses))
+    assert len(poses) == 16
+    assert metrics.ate_rmse_m < 0.002 * metrics.path_length_m
+    with pytest.raises(ValueError, match="feature 3 stands 2 times"):
+        odometry.step_tracks(np.array([3, 3]), np.ones((2, 2)))
+    with pytest.raises(ValueError, match="an image after tracks"):
+        odometry.step(BLANK)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize("motion", ["absolute", "relative"])
+def test_tracks_of_a_robot(data_root, motion):
+    tracks = read_planar_tracks(data_root / "sapienza_pr_vo")
+    # It sees as few as 14 landmarks.
+    odometry = MonoOdometry(tracks.camera, MonoOdometryOptions(motion=motion, detector=DETECTOR, min_inliers=10))
+    poses = []
+    for k in range(len(tracks)):
+        rows = tracks.frame(k)
+        estimate = odometry.step_tracks(tracks.track_index[rows], tracks.pixels[rows])
+        if not estimate.pending:
+            poses += [*estimate.earlier, estimate.world_from_cam]
+    times, truth = np.arange(len(poses), dtype=float), np.tile(np.eye(4), (len(poses), 1, 1))
+    truth[:, :3] = tracks.poses[: len(poses)]
+    assert len(poses) == len(tracks)
+    metrics = evaluate(Trajectory(times, np.stack(poses)), Trajectory(times, truth), "sim3")
+    # The measurements have no noise.
+    assert metrics.ate_rmse_m < 1e-4 * metrics.path_length_m
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vojax.cameras import Pinhole, RectifiedStereo
-from vojax.datasets import EurocSequence, KittiSequence, SyntheticStereoSequence
+from vojax.datasets import EurocSequence, KittiSequence, SyntheticStereoSequence, read_stereo_tracks
 from vojax.lie import SE3
 from vojax.metrics import Trajectory, evaluate
 from vojax.odometry import (
@@ -156,6 +156,12 @@ def test_rendered_street_is_followed(street):
         np.testing.assert_array_equal(one.world_from_cam, other.world_from_cam)
 
 
+def test_the_window_keeps_to_the_path(street):
+    estimates = drive(street, StereoOdometryOptions(window=True))
+    assert measure(street, estimates).drift_percent < 0.5
+    assert not any(e.bridged for e in estimates)
+
+
 @pytest.mark.parametrize("how", ["blank", "skipped"])
 def test_a_frame_without_content_is_bridged_and_the_next_inherits_no_guess(street, how):
     estimates = drive(street, **{how: (9,)})
@@ -213,6 +219,85 @@ def test_images_of_another_size_are_refused(street):
         odometry.step(np.zeros((100, 100), np.uint8), np.zeros((100, 100), np.uint8))
 
 
+# Tracks from elsewhere
+
+
+def tracked(street, k, points, rng, noise):
+    """Ids and measurements of points in a frame, in any order; every fifth without a match in the right image."""
+    pose = street.poses[k]
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    ahead = np.flatnonzero(local[:, 2] > 2.0)
+    measured = np.array(street.stereo.project(jnp.asarray(local[ahead], jnp.float32)))
+    inside = np.all((measured[:, :2] > 0) & (measured[:, :2] < [639, 239]), axis=1)
+    ids, measured = ahead[inside], measured[inside] + noise * rng.normal(size=(int(inside.sum()), 3))
+    measured[ids % 5 == 0, 2] = np.nan
+    order = rng.permutation(min(len(ids), 600))
+    return ids[order], measured[order]
+
+
+@pytest.mark.parametrize(("noise", "percent"), [(0.0, 0.01), (0.2, 0.5)])
+def test_tracks_of_another_front_end_are_followed(street, noise, percent):
+    rng = np.random.default_rng(4)
+    points = rng.uniform([-15.0, -6.0, 0.0], [15.0, 3.0, 60.0], (3000, 3))
+    points = points @ street.poses[0, :, :3].T + street.poses[0, :, 3]
+    odometry = StereoOdometry(street.stereo)
+    estimates = [odometry.step_tracks(*tracked(street, k, points, rng, noise)) for k in range(12)]
+    truth = np.tile(np.eye(4), (12, 1, 1))
+    truth[:, :3] = street.poses[:12]
+    poses = np.stack([e.world_from_cam for e in estimates])
+    assert evaluate(Trajectory(street.times[:12], poses), Trajectory(street.times[:12], truth)).drift_percent < percent
+    assert all(e.num_inliers > 100 for e in estimates[1:])
+    # Nothing to go by, and back again.
+    lost = odometry.step_tracks(np.zeros(0, int), np.zeros((0, 3)))
+    assert lost.bridged
+    assert Flag.texture in lost.flags
+    assert not odometry.step_tracks(*tracked(street, 13, points, rng, noise)).bridged
+
+
+@pytest.mark.parametrize(
+    ("ids", "measurements", "message"),
+    [
+        ([1, 1], np.ones((2, 3)), "feature 1 stands 2 times"),
+        ([1, 2], np.ones((3, 3)), r"ids have shape \(2,\) and pixels \(3, 2\)"),
+        ([1, 2], np.ones((2, 2)), r"measurements have shape \(2, 2\): expected \(u_left, v, u_right\)"),
+        ([1, 2], np.array([[1, 2, 3], [np.nan, 2, 3]]), r"feature 2 is at \(nan, 2.0\)"),
+        ([1.5, 2.0], np.ones((2, 3)), "ids are of float64"),
+    ],
+)
+def test_tracks_that_make_no_sense_are_refused(street, ids, measurements, message):
+    with pytest.raises(ValueError, match=message):
+        StereoOdometry(street.stereo).step_tracks(np.array(ids), measurements)
+
+
+def test_images_and_tracks_do_not_mix(street):
+    ids, measurements = np.arange(30), np.ones((30, 3))
+    odometry = StereoOdometry(street.stereo)
+    odometry.step(*street.images(0))
+    with pytest.raises(ValueError, match="tracks after an image"):
+        odometry.step_tracks(ids, measurements)
+    odometry = StereoOdometry(street.stereo)
+    odometry.step_tracks(ids, measurements)
+    with pytest.raises(ValueError, match="an image after tracks"):
+        odometry.step(*street.images(0))
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_stereo_tracks_of_kitti_00(data_root):
+    tracks = read_stereo_tracks(data_root / "kitti00_stereo_tracks")
+    truth = np.loadtxt(data_root / "trajectories" / "KITTI_00_gt.txt").reshape(-1, 3, 4)[: len(tracks)]
+    odometry = StereoOdometry(tracks.stereo)
+    poses = []
+    for k in range(len(tracks)):
+        rows = tracks.frame(k)
+        poses.append(odometry.step_tracks(tracks.track_index[rows], tracks.measurements[rows]).world_from_cam)
+    times = np.arange(len(tracks), dtype=float)
+    whole = np.tile(np.eye(4), (len(tracks), 1, 1))
+    whole[:, :3] = truth
+    # The poses that come with the tracks are 0.37 m off; the truth itself starts with wrong steps.
+    assert evaluate(Trajectory(times, np.stack(poses)), Trajectory(times, whole), "se3").ate_rmse_m < 0.5
+
+
 @pytest.mark.data
 def test_kitti_06_clip(data_root):
     sequence = KittiSequence(data_root / "kitti", "06")
@@ -236,6 +321,8 @@ def test_an_unrectified_pair_at_rest(data_root):
     rectifier = PairRectifier(*sequence.cameras, sequence.cam1_from_cam0, sequence.size)
     odometry = StereoOdometry(rectifier)
     estimates = [odometry.step(*sequence.images(k)) for k in range(len(sequence))]
-    assert all(Flag.static in e.flags and not e.bridged for e in estimates[1:])
+    # Once the drone stirs by a third of a pixel.
+    assert sum(Flag.static in e.flags for e in estimates[1:]) >= len(estimates) - 2
+    assert not any(e.bridged for e in estimates)
     for e in estimates:
         assert np.linalg.norm(e.world_from_cam[:3, 3]) < 5e-3

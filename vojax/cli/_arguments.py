@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+WINDOW = {"auto": None, "on": True, "off": False}
+
 _DESCRIPTION = "Visual odometry in JAX. `vojax COMMAND --help` explains a command, `vojax --version` says the version."
 
 
@@ -22,8 +24,8 @@ class Demo:
     """How to estimate; an unknown name lists them all."""
     frames: Annotated[int, tyro.conf.arg(metavar="N")] = 48
     """Length of the sequence."""
-    window: bool = True
-    """Adjust the last keyframes together."""
+    window: Literal["auto", "on", "off"] = "auto"
+    """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the street and of the random sampling; the same seed gives the same path."""
 
@@ -46,8 +48,8 @@ class Run:
     """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
     camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which camera of that file; needed where it has several."""
-    window: bool = True
-    """Adjust the last keyframes together."""
+    window: Literal["auto", "on", "off"] = "auto"
+    """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Stop after this many frames."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -74,8 +76,8 @@ class Compare:
     """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
     camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which camera of that file; needed where it has several."""
-    window: bool = True
-    """Adjust the last keyframes together."""
+    window: Literal["auto", "on", "off"] = "auto"
+    """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Stop after this many frames."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0

@@ -4,7 +4,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from ._arguments import Compare
+from ._arguments import WINDOW, Compare
 from ._run_command import warn_without_cache
 
 # Key of metrics.json, heading, format.
@@ -36,6 +36,8 @@ def execute(command: Compare) -> None:
         find_pipeline(name)
     prepare_folder(command.out)
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=140)  # a file has room for whole columns
     rows = [_run_one(command, name, console) for name in command.pipelines]
     done = [row for row in rows if "frames" in row]
     if not done:
@@ -58,7 +60,7 @@ def _run_one(command: Compare, name: str, console: Any) -> dict[str, Any]:
             _open(command, name),
             command.out / name,
             pipeline=name,
-            window=command.window,
+            window=WINDOW[command.window],
             seed=command.seed,
             max_frames=command.max_frames,
             console=console,

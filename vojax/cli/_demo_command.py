@@ -1,6 +1,6 @@
 """`vojax demo`: a sequence that vojax renders itself."""
 
-from ._arguments import Demo
+from ._arguments import WINDOW, Demo
 from ._run_command import warn_without_cache
 
 
@@ -17,7 +17,7 @@ def execute(command: Demo) -> None:
         SyntheticStereoSequence(frames=command.frames, seed=command.seed),
         command.out,
         pipeline=command.pipeline,
-        window=command.window,
+        window=WINDOW[command.window],
         seed=command.seed,
         view_frame=command.frames // 2,
     )

@@ -45,7 +45,7 @@ def run_sequence(
     out: pathlib.Path,
     *,
     pipeline: str = "stereo-3d2d",
-    window: bool = True,
+    window: bool | None = None,
     seed: int = 0,
     max_frames: int | None = None,
     view_frame: int | None = None,
@@ -70,7 +70,7 @@ def run_sequence(
         sequence: A `vojax.datasets.FrameSequence` with those images that the pipeline takes, or a `FrameSource`.
         out: Folder for the results.
         pipeline: Name in `vojax.odometry.PIPELINES`.
-        window: Adjust the last keyframes together.
+        window: Adjust the last keyframes together; None leaves it to the pipeline.
         seed: Of the random sampling.
         max_frames: Stop after this many frames.
         view_frame: Draw the tracks of this frame, or of the last one before it, into `view.png`.
@@ -95,7 +95,8 @@ def run_sequence(
     console = Console() if console is None else console
     frames = len(sequence) if max_frames is None else min(max_frames, len(sequence))
     chosen = PIPELINES[pipeline]
-    odometry = chosen.odometry(source.camera, chosen.options(window=window), seed=seed)
+    options = chosen.options() if window is None else chosen.options(window=window)
+    odometry = chosen.odometry(source.camera, options, seed=seed)
     log, clock = RunLog(TrajectoryFiles(out, sequence.times)), FrameClock()
     failure: Exception | None = None
     ending: str | None = None
@@ -119,7 +120,7 @@ def run_sequence(
     metrics = {
         "sequence": sequence.name,
         "pipeline": pipeline,
-        "window": window,
+        "window": options.window,
         "seed": seed,
         **compared,
         "frames": len(log.poses),
@@ -143,7 +144,7 @@ def run_sequence(
         "device": jax.default_backend(),
     }
     write_json(out / "metrics.json", metrics)
-    title = f"{sequence.name} · {pipeline}{'' if window else ' without window'}"
+    title = f"{sequence.name} · {pipeline}{' without window' if window is False else ''}"
     pictures = _draw(estimate, truth, alignment, clock, log, out, title)
     print_metrics(console, f"{sequence.name}, {pipeline}", metrics)
     for sentence in _remarks(log):

@@ -3,7 +3,7 @@
 import contextlib
 import sys
 
-from ._arguments import Run
+from ._arguments import WINDOW, Run
 from ._compilation_cache import enable_compilation_cache
 
 
@@ -34,7 +34,7 @@ def execute(command: Run) -> None:
             source,
             command.out,
             pipeline=command.pipeline,
-            window=command.window,
+            window=WINDOW[command.window],
             seed=command.seed,
             max_frames=command.max_frames,
             viewer=viewer,

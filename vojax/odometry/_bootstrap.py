@@ -23,7 +23,7 @@ from vojax.solvers import homography_dlt
 
 from ._absolute_motion import AbsoluteMotionOptions, absolute_motion
 from ._relative_motion import triangulate_pairs
-from ._tracks import Features, padded, shared
+from ._tracks import Features, padded, room_for, shared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +33,8 @@ class BootstrapOptions:
     Attributes:
         min_parallax_rad: Least median angle between the rays of the landmarks.
         min_landmarks: Fewest landmarks to begin with.
-        min_share: Share of the first view's features that must still be followed; with less a later view takes its
-            place.
+        min_share: Share of the first view's features that must still be followed; with less, or with fewer than
+            `min_landmarks`, a later view takes its place.
         sigma_px: Standard deviation of a tracked position.
         ransac: The search.
     """
@@ -86,6 +86,7 @@ class Bootstrap:
             The poses so far, or None to wait for another frame.
         """
         self._frames.append(features)
+        self._size = room_for(len(features.ids), self._size)
         self._choose_first()
         first = self._frames[0]
         rows0, rows1 = shared(first.ids, features.ids)
@@ -120,7 +121,8 @@ class Bootstrap:
         newest = self._frames[-1]
         while len(self._frames) > 1:
             first = self._frames[0]
-            if len(shared(first.ids, newest.ids)[0]) >= self._options.min_share * len(first.ids) > 0:
+            enough = max(self._options.min_share * len(first.ids), self._options.min_landmarks)
+            if len(shared(first.ids, newest.ids)[0]) >= enough:
                 return
             self._frames.pop(0)
             self._before += 1

@@ -24,7 +24,7 @@ from ._motion import Motion, MotionOptions, RigidMotionOptions, StereoFeatures, 
 from ._rectification import DisparityCalibration
 from ._rigid_motion import rigid_motion
 from ._sliding_window import Keyframe, SlidingWindow, WindowOptions, orthonormal
-from ._tracks import Features, FeatureTracks
+from ._tracks import Features, FeatureTracks, given_features, room_for
 
 
 @runtime_checkable
@@ -117,18 +117,41 @@ class DisparityOdometry:
             ValueError: If the image is not like those before.
         """
         reference = self._reference
-        if reference is not None and gray.shape != reference.features.image.shape:
-            height, width = reference.features.image.shape
+        before = None if reference is None else reference.features.image
+        if before is not None and gray.shape != before.shape:
             raise ValueError(
-                f"image {self._count} is {gray.shape[1]}×{gray.shape[0]} px, the one before was {width}×{height}: "
-                "a sequence has one size"
+                f"image {self._count} is {gray.shape[1]}×{gray.shape[0]} px, the one before was "
+                f"{before.shape[1]}×{before.shape[0]}: a sequence has one size"
             )
-        motion = None if self._gap == 1 else _repeated(self._motion, float(self._gap))
-        guess = self._motion if motion is None else motion
+        guess = self._guess()
         features = self._follow(gray, reference, guess)
-        measured = measure(features.pixels)
-        frame = _Frame(features, measured, _padded(measured, self._size), features.pixels)
         flags = image_flags(gray, len(features.pixels), self._options.checks)
+        return self._take(features, measure(features.pixels), guess, flags)
+
+    def step_tracks(self, ids: np.ndarray, measured: Measured) -> FrameEstimate:
+        """Take the next frame by its features, followed elsewhere.
+
+        Args:
+            ids: A whole number for each feature, the same in all frames.
+            measured: Where they are in the ideal pair.
+
+        Raises:
+            ValueError: If a feature stands there twice or nowhere, or images came before.
+        """
+        features, order = given_features(ids, measured.pixels, self._reference and self._reference.features)
+        matches = StereoMatches(*(field[order] for field in measured.matches))
+        self._size = room_for(len(order), self._size)
+        few = len(order) < self._options.checks.min_features
+        flags = (Flag.texture,) if few else ()
+        return self._take(features, Measured(features.pixels, matches), self._guess(), flags)
+
+    def _guess(self) -> SE3:
+        """The motion since the reference, should the last one repeat itself."""
+        return self._motion if self._gap == 1 else _repeated(self._motion, float(self._gap))
+
+    def _take(self, features: Features, measured: Measured, guess: SE3, flags: tuple[Flag, ...]) -> FrameEstimate:
+        frame = _Frame(features, measured, _padded(measured, self._size), features.pixels)
+        reference = self._reference
         estimate = self._first(frame, flags) if reference is None else self._next(reference, frame, guess, flags)
         self._count += 1
         return estimate
@@ -217,8 +240,7 @@ class DisparityOdometry:
 
     def _ahead(self) -> np.ndarray:
         """The pose now, should the motion have repeated itself since the reference."""
-        motion = self._motion if self._gap == 1 else _repeated(self._motion, float(self._gap))
-        return orthonormal(self._pose @ np.asarray(_inverse_matrix(motion), np.float64))
+        return orthonormal(self._pose @ np.asarray(_inverse_matrix(self._guess()), np.float64))
 
     def _bridge(self, flags: tuple[Flag, ...]) -> FrameEstimate:
         """Repeat the last motion; the reference stays."""

@@ -26,7 +26,7 @@ from ._mono_window import MonoKeyframe, MonoWindow, MonoWindowOptions
 from ._planar_motion import PlanarMotionOptions, planar_motion
 from ._relative_motion import RelativeMotionOptions, relative_motion
 from ._sliding_window import orthonormal
-from ._tracks import Features, FeatureTracks, padded, shared
+from ._tracks import Features, FeatureTracks, given_features, padded, room_for, shared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,12 +120,36 @@ class MonoOdometry:
             ValueError: If the image is not like those before.
         """
         gray, previous = to_gray(image), self._features
-        if previous is not None and gray.shape != previous.image.shape:
+        before = None if previous is None else previous.image
+        if before is not None and gray.shape != before.shape:
             raise ValueError(
                 f"image {self._count} is {gray.shape[1]}×{gray.shape[0]} px, the one before was "
-                f"{previous.image.shape[1]}×{previous.image.shape[0]}: a sequence has one size"
+                f"{before.shape[1]}×{before.shape[0]}: a sequence has one size"
             )
         features = self._tracks.step(gray, previous, self._predicted)
+        estimate = self._take(features)
+        self._predicted = self._predict(features)
+        return estimate
+
+    def step_tracks(self, ids: np.ndarray, pixels: np.ndarray) -> FrameEstimate:
+        """Take the next frame by its features, followed by a front end of your own.
+
+        Args:
+            ids: A whole number for each feature `[n]`, the same in all frames.
+            pixels: Where they are `[n, 2]`.
+
+        Returns:
+            The new pose and what it rests on.
+
+        Raises:
+            ValueError: If the arrays do not fit together, a feature stands there twice, or images came before.
+        """
+        features, _ = given_features(ids, pixels, self._features)
+        self._size = room_for(len(features.ids), self._size)
+        return self._take(features)
+
+    def _take(self, features: Features) -> FrameEstimate:
+        previous = self._features
         if previous is None:
             self._begin()
             self._add_to_bootstrap(features)
@@ -135,7 +159,6 @@ class MonoOdometry:
         else:
             estimate = self._follow(previous, features)
         self._features, self._skipped = features, 0
-        self._predicted = self._predict(features)
         self._count += 1
         return estimate
 

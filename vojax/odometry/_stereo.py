@@ -10,7 +10,14 @@ import dataclasses
 import numpy as np
 
 from vojax.cameras import RectifiedStereo
-from vojax.features import DetectorOptions, StereoOptions, TrackerOptions, match_stereo_rows, to_gray
+from vojax.features import (
+    DetectorOptions,
+    StereoMatches,
+    StereoOptions,
+    TrackerOptions,
+    match_stereo_rows,
+    to_gray,
+)
 
 from ._disparity_odometry import DisparityOdometry, Measured
 from ._frame import FrameEstimate
@@ -26,7 +33,9 @@ class StereoOdometryOptions:
     """Stages of the pipeline.
 
     Attributes:
-        window: Adjust the last keyframes together; False chains the motions as they are.
+        window: Adjust the last keyframes together; False chains the motions as they are. Tracks drift by a random
+            walk, which the chain weighs rightly and the window, whose keyframes are fewer, does not: see the
+            documentation for what it was measured to gain and to lose.
         min_inliers: With fewer, a frame counts as not tracked and the last motion bridges it.
         detector: Corners.
         tracker: From frame to frame.
@@ -38,7 +47,7 @@ class StereoOdometryOptions:
         sliding_window: The window.
     """
 
-    window: bool = True
+    window: bool = False
     min_inliers: int = 12
     detector: DetectorOptions = DetectorOptions(max_features=600)
     tracker: TrackerOptions = TrackerOptions()
@@ -102,6 +111,37 @@ class StereoOdometry:
             return Measured(pixels, match_stereo_rows(left, right, pixels, self._options.matcher))
 
         return self._as_taken(self._odometry.step(left, measure))
+
+    def step_tracks(
+        self, ids: np.ndarray, measurements: np.ndarray, sigma_disparity_px: float | np.ndarray = 0.25
+    ) -> FrameEstimate:
+        """Take the next pair by its features, followed by a front end of your own.
+
+        Args:
+            ids: A whole number for each feature `[n]`, the same in all frames.
+            measurements: `(u_left, v, u_right)` of the rectified pair `[n, 3]`; u_right not finite where the right
+                image has no match.
+            sigma_disparity_px: Standard deviation of u_left − u_right, one or `[n]`.
+
+        Returns:
+            The new pose of the rectified left camera and what it rests on.
+
+        Raises:
+            ValueError: If the arrays do not fit together, a feature stands there twice, or images came before.
+        """
+        measurements = np.asarray(measurements, np.float32)
+        if measurements.ndim != 2 or measurements.shape[1] != 3:
+            raise ValueError(f"measurements have shape {measurements.shape}: expected (u_left, v, u_right) [n, 3]")
+        disparity = measurements[:, 0] - measurements[:, 2]
+        valid = np.isfinite(disparity) & (disparity > 0)
+        sigma = np.broadcast_to(np.asarray(sigma_disparity_px, np.float32), disparity.shape)
+        matches = StereoMatches(
+            np.where(valid, disparity, np.float32(0)),
+            valid.astype(np.float32),
+            np.where(valid, sigma, np.float32(1)),
+            valid,
+        )
+        return self._odometry.step_tracks(ids, Measured(measurements[:, :2], matches))
 
     def skip(self) -> FrameEstimate:
         """Bridge a pair that cannot be read: the last motion is repeated.

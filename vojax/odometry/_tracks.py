@@ -11,7 +11,7 @@ class Features(NamedTuple):
     """Features of an image: first those followed from the image before, then new ones.
 
     Attributes:
-        image: Grey, uint8.
+        image: Grey, uint8; None for features that were followed elsewhere.
         ids: A number for each feature, the same in all images.
         pixels: `[n, 2]`.
         quality: Of the tracks, higher is better; 0 for new ones.
@@ -19,7 +19,7 @@ class Features(NamedTuple):
         missed: Features of the image before that were not found again.
     """
 
-    image: np.ndarray
+    image: np.ndarray | None
     ids: np.ndarray
     pixels: np.ndarray
     quality: np.ndarray
@@ -46,6 +46,8 @@ class FeatureTracks:
         rows = np.zeros(0, np.intp)
         ids, pixels, quality = np.zeros(0, np.intp), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
         if previous is not None:
+            if previous.image is None:
+                raise ValueError("an image after tracks: a sequence has one or the other")
             tracks = track(previous.image, image, previous.pixels, self._tracker, guess=predicted)
             rows = np.flatnonzero(tracks.valid)
             ids, pixels, quality = previous.ids[rows], tracks.pixels[rows], tracks.quality[rows]
@@ -61,6 +63,46 @@ class FeatureTracks:
             rows,
             0 if previous is None else len(previous.ids) - len(rows),
         )
+
+
+def given_features(ids: np.ndarray, pixels: np.ndarray, previous: Features | None) -> tuple[Features, np.ndarray]:
+    """Features that were followed elsewhere.
+
+    Args:
+        ids: A whole number for each, the same in all images `[n]`.
+        pixels: Where they are `[n, 2]`.
+        previous: Of the image before; None at the start.
+
+    Returns:
+        The features, and where in the input each of them was.
+
+    Raises:
+        ValueError: The arrays do not fit together, a feature stands there twice, or a position is not finite.
+    """
+    ids, pixels = np.asarray(ids), np.asarray(pixels, np.float32)
+    if ids.ndim != 1 or pixels.shape != (len(ids), 2):
+        raise ValueError(f"ids have shape {ids.shape} and pixels {pixels.shape}: expected [n] and [n, 2]")
+    if len(ids) and not np.issubdtype(ids.dtype, np.integer):
+        raise ValueError(f"ids are of {ids.dtype}: expected whole numbers")
+    ids = ids.astype(np.int64)
+    if len(np.unique(ids)) < len(ids):
+        values, counts = np.unique(ids, return_counts=True)
+        raise ValueError(f"feature {values[counts.argmax()]} stands {counts.max()} times in a frame: expected once")
+    if not np.isfinite(pixels).all():
+        row = int(np.flatnonzero(~np.isfinite(pixels).all(axis=1))[0])
+        raise ValueError(f"feature {ids[row]} is at ({pixels[row, 0]}, {pixels[row, 1]}): expected finite pixels")
+    if previous is not None and previous.image is not None:
+        raise ValueError("tracks after an image: a sequence has one or the other")
+    rows, followed = shared(previous.ids, ids) if previous is not None else (np.zeros(0, np.intp),) * 2
+    order = np.concatenate([followed, np.setdiff1d(np.arange(len(ids)), followed)])
+    quality = (np.arange(len(ids)) < len(followed)).astype(np.float32)
+    missed = 0 if previous is None else len(previous.ids) - len(rows)
+    return Features(None, ids[order], pixels[order], quality, rows, missed), order
+
+
+def room_for(count: int, size: int) -> int:
+    """Rows of arrays for so many features, `size` where that is enough: few numbers, as each is a compilation."""
+    return size if count <= size else 1 << (count - 1).bit_length()
 
 
 def shared(ids0: np.ndarray, ids1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
