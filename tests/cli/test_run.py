@@ -28,6 +28,13 @@ def read_metrics(tmp_path):
     return json.loads((tmp_path / "out" / "metrics.json").read_text())
 
 
+def test_features_that_are_matched(run_kitti, fake, tmp_path):
+    assert run_kitti("--features", "orb").status == 0
+    assert fake.made[0].options.detector.kind == "orb"
+    assert read_metrics(tmp_path)["features"] == "orb"
+    assert "kind is 'surf': expected one of sift, orb" in run_kitti("--features", "surf").error
+
+
 def test_writes_trajectories_metrics_and_picture(run_kitti, fake, drawn_for_real, tmp_path):
     outcome = run_kitti("--seed", 3, "--window", "off")
     assert outcome.status == 0

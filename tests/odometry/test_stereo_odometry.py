@@ -10,6 +10,7 @@ import pytest
 
 from vojax.cameras import Pinhole, RectifiedStereo
 from vojax.datasets import EurocSequence, KittiSequence, SyntheticStereoSequence, read_stereo_tracks
+from vojax.features import DescriptorOptions
 from vojax.lie import SE3
 from vojax.metrics import Trajectory, evaluate
 from vojax.odometry import (
@@ -160,6 +161,14 @@ def test_the_window_keeps_to_the_path(street):
     estimates = drive(street, StereoOdometryOptions(window=True))
     assert measure(street, estimates).drift_percent < 0.5
     assert not any(e.bridged for e in estimates)
+
+
+@pytest.mark.parametrize("kind", ["sift", "orb"])
+def test_matched_features_are_followed(street, kind):
+    estimates = drive(street, StereoOdometryOptions(detector=DescriptorOptions(kind=kind, max_features=600)))
+    assert measure(street, estimates).drift_percent < {"sift": 1.0, "orb": 2.0}[kind]
+    assert not any(e.bridged for e in estimates)
+    assert np.mean([e.num_inliers for e in estimates[1:]]) > 50
 
 
 @pytest.mark.parametrize("how", ["blank", "skipped"])

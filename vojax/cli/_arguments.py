@@ -48,6 +48,8 @@ class Run:
     """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
     camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which camera of that file; needed where it has several."""
+    features: Annotated[str, tyro.conf.arg(metavar="NAME")] = "corners"
+    """Corners that are tracked; or sift, orb … (what the installed OpenCV has), matched by their descriptors."""
     window: Literal["auto", "on", "off"] = "auto"
     """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
@@ -76,6 +78,8 @@ class Compare:
     """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
     camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Which camera of that file; needed where it has several."""
+    features: Annotated[str, tyro.conf.arg(metavar="NAME")] = "corners"
+    """Corners that are tracked; or sift, orb … (what the installed OpenCV has), matched by their descriptors."""
     window: Literal["auto", "on", "off"] = "auto"
     """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
     max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None

@@ -61,6 +61,7 @@ def _run_one(command: Compare, name: str, console: Any) -> dict[str, Any]:
             command.out / name,
             pipeline=name,
             window=WINDOW[command.window],
+            features=command.features,
             seed=command.seed,
             max_frames=command.max_frames,
             console=console,

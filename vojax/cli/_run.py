@@ -15,6 +15,7 @@ from rich.console import Console
 
 from vojax._version import __version__
 from vojax.datasets import FrameSequence
+from vojax.features import DescriptorOptions
 from vojax.metrics import Trajectory, align, evaluate, kitti_errors
 from vojax.odometry import PIPELINES, Flag, FrameEstimate
 from vojax.viz import draw_tracks, plot_drift_by_length, plot_timings, plot_trajectory, save_figure
@@ -46,6 +47,7 @@ def run_sequence(
     *,
     pipeline: str = "stereo-3d2d",
     window: bool | None = None,
+    features: str = "corners",
     seed: int = 0,
     max_frames: int | None = None,
     view_frame: int | None = None,
@@ -71,6 +73,7 @@ def run_sequence(
         out: Folder for the results.
         pipeline: Name in `vojax.odometry.PIPELINES`.
         window: Adjust the last keyframes together; None leaves it to the pipeline.
+        features: "corners" are tracked; a kind of `vojax.features.DescriptorOptions` is matched.
         seed: Of the random sampling.
         max_frames: Stop after this many frames.
         view_frame: Draw the tracks of this frame, or of the last one before it, into `view.png`.
@@ -95,7 +98,10 @@ def run_sequence(
     console = Console() if console is None else console
     frames = len(sequence) if max_frames is None else min(max_frames, len(sequence))
     chosen = PIPELINES[pipeline]
-    options = chosen.options() if window is None else chosen.options(window=window)
+    settings: dict[str, Any] = {} if window is None else {"window": window}
+    if features != "corners":
+        settings["detector"] = DescriptorOptions(kind=features)
+    options = chosen.options(**settings)
     odometry = chosen.odometry(source.camera, options, seed=seed)
     log, clock = RunLog(TrajectoryFiles(out, sequence.times)), FrameClock()
     failure: Exception | None = None
@@ -121,6 +127,7 @@ def run_sequence(
         "sequence": sequence.name,
         "pipeline": pipeline,
         "window": options.window,
+        "features": features,
         "seed": seed,
         **compared,
         "frames": len(log.poses),
@@ -144,7 +151,9 @@ def run_sequence(
         "device": jax.default_backend(),
     }
     write_json(out / "metrics.json", metrics)
-    title = f"{sequence.name} · {pipeline}{' without window' if window is False else ''}"
+    how = [] if features == "corners" else [features]
+    how += ["without window"] if window is False else []
+    title = " · ".join([sequence.name, pipeline, *how])
     pictures = _draw(estimate, truth, alignment, clock, log, out, title)
     print_metrics(console, f"{sequence.name}, {pipeline}", metrics)
     for sentence in _remarks(log):

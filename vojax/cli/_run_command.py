@@ -35,6 +35,7 @@ def execute(command: Run) -> None:
             command.out,
             pipeline=command.pipeline,
             window=WINDOW[command.window],
+            features=command.features,
             seed=command.seed,
             max_frames=command.max_frames,
             viewer=viewer,

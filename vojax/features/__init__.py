@@ -1,5 +1,10 @@
 from ._chessboard import chessboard_points as chessboard_points
 from ._chessboard import find_chessboard as find_chessboard
+from ._describe import Described as Described
+from ._describe import DescriptorOptions as DescriptorOptions
+from ._describe import Matches as Matches
+from ._describe import describe as describe
+from ._describe import match_descriptors as match_descriptors
 from ._detect import DetectorOptions as DetectorOptions
 from ._detect import Keypoints as Keypoints
 from ._detect import detect as detect

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vojax.cameras import RectifiedStereo
-from vojax.features import DetectorOptions, StereoMatches, TrackerOptions
+from vojax.features import DescriptorOptions, DetectorOptions, StereoMatches, TrackerOptions
 from vojax.lie import SE3
 
 from ._frame import Flag, FrameEstimate
@@ -24,7 +24,7 @@ from ._motion import Motion, MotionOptions, RigidMotionOptions, StereoFeatures, 
 from ._rectification import DisparityCalibration
 from ._rigid_motion import rigid_motion
 from ._sliding_window import Keyframe, SlidingWindow, WindowOptions, orthonormal
-from ._tracks import Features, FeatureTracks, given_features, room_for
+from ._tracks import Features, front_end, given_features, room_for
 
 
 @runtime_checkable
@@ -36,7 +36,7 @@ class Stages(Protocol):
     @property
     def min_inliers(self) -> int: ...
     @property
-    def detector(self) -> DetectorOptions: ...
+    def detector(self) -> DetectorOptions | DescriptorOptions: ...
     @property
     def tracker(self) -> TrackerOptions: ...
     @property
@@ -90,7 +90,7 @@ class DisparityOdometry:
         self._options = options
         self._key = jax.random.key(seed)
         self._distort = distort
-        self._tracks = FeatureTracks(options.detector, options.tracker)
+        self._tracks = front_end(options.detector, options.tracker)
         self._size = -(-options.detector.max_features // 64) * 64
         self._window = SlidingWindow(stereo, options.sliding_window)
         self._reference: _Frame | None = None

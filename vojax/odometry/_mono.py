@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vojax.cameras import Camera
-from vojax.features import DetectorOptions, TrackerOptions, to_gray
+from vojax.features import DescriptorOptions, DetectorOptions, TrackerOptions, to_gray
 from vojax.lie import SE3
 
 from ._absolute_motion import AbsoluteMotionOptions, absolute_motion
@@ -26,7 +26,7 @@ from ._mono_window import MonoKeyframe, MonoWindow, MonoWindowOptions
 from ._planar_motion import PlanarMotionOptions, planar_motion
 from ._relative_motion import RelativeMotionOptions, relative_motion
 from ._sliding_window import orthonormal
-from ._tracks import Features, FeatureTracks, given_features, padded, room_for, shared
+from ._tracks import Features, front_end, given_features, padded, room_for, shared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +40,8 @@ class MonoOdometryOptions:
         guided: Sample the best tracks first; False samples uniformly.
         min_inliers: With fewer, a frame counts as not tracked and the last motion bridges it.
         max_bridged: After more frames in a row than this the pipeline starts anew.
-        detector: Corners.
-        tracker: From frame to frame.
+        detector: Corners that are tracked, or (`DescriptorOptions`) features that are matched.
+        tracker: From frame to frame; not read where features are matched.
         bootstrap: The first motion.
         absolute: Motion from landmarks.
         relative: Motion from an essential matrix.
@@ -55,7 +55,7 @@ class MonoOdometryOptions:
     guided: bool = True
     min_inliers: int = 15
     max_bridged: int = 3
-    detector: DetectorOptions = DetectorOptions(max_features=800)
+    detector: DetectorOptions | DescriptorOptions = DetectorOptions(max_features=800)
     tracker: TrackerOptions = TrackerOptions()
     bootstrap: BootstrapOptions = BootstrapOptions()
     absolute: AbsoluteMotionOptions = AbsoluteMotionOptions()
@@ -92,7 +92,7 @@ class MonoOdometry:
         self._camera = camera
         self._options = options
         self._key = jax.random.key(seed)
-        self._tracks = FeatureTracks(options.detector, options.tracker)
+        self._tracks = front_end(options.detector, options.tracker)
         self._window = MonoWindow(camera, options.mono_window)
         self._size = -(-options.detector.max_features // 64) * 64
         self._features: Features | None = None

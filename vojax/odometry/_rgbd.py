@@ -14,7 +14,7 @@ import numpy as np
 
 from vojax._types import Array, Float
 from vojax.cameras import Camera, Pinhole, RectifiedStereo
-from vojax.features import DetectorOptions, StereoMatches, TrackerOptions, to_gray
+from vojax.features import DescriptorOptions, DetectorOptions, StereoMatches, TrackerOptions, to_gray
 
 from ._disparity_odometry import DisparityOdometry, Measured
 from ._frame import FrameEstimate
@@ -58,8 +58,8 @@ class RgbdOdometryOptions:
     Attributes:
         window: Adjust the last keyframes together; False chains the motions as they are.
         min_inliers: With fewer, a frame counts as not tracked and the last motion bridges it.
-        detector: Corners.
-        tracker: From frame to frame.
+        detector: Corners that are tracked, or (`DescriptorOptions`) features that are matched.
+        tracker: From frame to frame; not read where features are matched.
         depth: Depths at corners.
         motion: Pose of the new frame.
         checks: When a frame is flagged.
@@ -69,7 +69,7 @@ class RgbdOdometryOptions:
 
     window: bool = True
     min_inliers: int = 12
-    detector: DetectorOptions = DetectorOptions(max_features=600)
+    detector: DetectorOptions | DescriptorOptions = DetectorOptions(max_features=600)
     tracker: TrackerOptions = TrackerOptions()
     depth: DepthOptions = DepthOptions()
     motion: MotionOptions = MotionOptions(self_calibrate=False)

@@ -11,6 +11,7 @@ import numpy as np
 
 from vojax.cameras import RectifiedStereo
 from vojax.features import (
+    DescriptorOptions,
     DetectorOptions,
     StereoMatches,
     StereoOptions,
@@ -37,8 +38,8 @@ class StereoOdometryOptions:
             walk, which the chain weighs rightly and the window, whose keyframes are fewer, does not: see the
             documentation for what it was measured to gain and to lose.
         min_inliers: With fewer, a frame counts as not tracked and the last motion bridges it.
-        detector: Corners.
-        tracker: From frame to frame.
+        detector: Corners that are tracked, or (`DescriptorOptions`) features that are matched.
+        tracker: From frame to frame; not read where features are matched.
         matcher: From left to right.
         motion: Pose of the new frame: from points to pixels (`MotionOptions`, 3-D-to-2-D) or from points to points
             (`RigidMotionOptions`, 3-D-to-3-D).
@@ -49,7 +50,7 @@ class StereoOdometryOptions:
 
     window: bool = False
     min_inliers: int = 12
-    detector: DetectorOptions = DetectorOptions(max_features=600)
+    detector: DetectorOptions | DescriptorOptions = DetectorOptions(max_features=600)
     tracker: TrackerOptions = TrackerOptions()
     matcher: StereoOptions = StereoOptions()
     motion: MotionOptions | RigidMotionOptions = MotionOptions()

@@ -4,7 +4,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vojax.features import DetectorOptions, TrackerOptions, detect, track
+from vojax.features import (
+    Described,
+    DescriptorOptions,
+    DetectorOptions,
+    TrackerOptions,
+    describe,
+    detect,
+    match_descriptors,
+    track,
+)
 
 
 class Features(NamedTuple):
@@ -17,6 +26,7 @@ class Features(NamedTuple):
         quality: Of the tracks, higher is better; 0 for new ones.
         rows: Which row of the image before each followed feature was, `[m]` with m ≤ n.
         missed: Features of the image before that were not found again.
+        descriptors: Of features that are matched, `[n, d]`.
     """
 
     image: np.ndarray | None
@@ -25,6 +35,7 @@ class Features(NamedTuple):
     quality: np.ndarray
     rows: np.ndarray
     missed: int
+    descriptors: np.ndarray | None = None
 
 
 class FeatureTracks:
@@ -63,6 +74,46 @@ class FeatureTracks:
             rows,
             0 if previous is None else len(previous.ids) - len(rows),
         )
+
+
+class FeatureMatches:
+    """Finds features in every image by themselves, and those of the image before by their descriptors."""
+
+    def __init__(self, options: DescriptorOptions):
+        self._options = options
+        self._next_id = 0
+
+    def step(self, image: np.ndarray, previous: Features | None, predicted: np.ndarray | None = None) -> Features:
+        """Features of the next image; see `FeatureTracks.step`."""
+        found = describe(image, self._options)
+        rows, again = np.zeros(0, np.intp), np.zeros(0, np.intp)
+        ids, quality = np.zeros(0, np.intp), np.zeros(0, np.float32)
+        if previous is not None:
+            if previous.descriptors is None:
+                raise ValueError("an image after tracks: a sequence has one or the other")
+            before = Described(previous.pixels, previous.descriptors)
+            rows, again, quality = match_descriptors(before, found, self._options, predicted)
+            ids = previous.ids[rows]
+        fresh = np.setdiff1d(np.arange(len(found.pixels)), again)
+        new_ids = self._next_id + np.arange(len(fresh))
+        self._next_id += len(fresh)
+        order = np.concatenate([again, fresh])
+        return Features(
+            image,
+            np.concatenate([ids, new_ids]),
+            found.pixels[order],
+            np.concatenate([quality, np.zeros(len(fresh), np.float32)]),
+            rows,
+            0 if previous is None else len(previous.ids) - len(rows),
+            found.descriptors[order],
+        )
+
+
+def front_end(detector: DetectorOptions | DescriptorOptions, tracker: TrackerOptions) -> FeatureTracks | FeatureMatches:
+    """Tracking of corners, or matching of descriptors."""
+    if isinstance(detector, DescriptorOptions):
+        return FeatureMatches(detector)
+    return FeatureTracks(detector, tracker)
 
 
 def given_features(ids: np.ndarray, pixels: np.ndarray, previous: Features | None) -> tuple[Features, np.ndarray]:
