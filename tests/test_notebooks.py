@@ -13,6 +13,7 @@ def test_runs(path, monkeypatch):
     from nbclient import NotebookClient
 
     monkeypatch.setenv("VOJAX_NOTEBOOK_SMALL", "1")
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # compilation is most of the time
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
