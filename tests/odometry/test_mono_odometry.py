@@ -348,6 +348,19 @@ def test_a_loss_is_bridged_said_and_followed_by_a_new_start(street):
     assert measure(street, poses).drift_percent < 10.0
 
 
+def test_what_a_frame_lacks_is_said(street, followed):
+    estimates, _ = followed("absolute")
+    assert not any(e.flags for e in estimates)
+    odometry = MonoOdometry(street.camera, MonoOdometryOptions(detector=DETECTOR))
+    images = [street.images(k)[0] for k in range(3)]
+    assert odometry.step(images[0]).flags == ()
+    assert odometry.step(images[0]).flags == (Flag.static,)
+    upside_down = np.ascontiguousarray(images[1][::-1, ::-1])
+    assert Flag.overlap in odometry.step(upside_down).flags
+    assert odometry.step(BLANK).flags == (Flag.texture, Flag.dark)
+    assert Flag.bright in odometry.step(np.full_like(BLANK, 255)).flags
+
+
 def test_images_of_another_size_are_refused(street):
     odometry = MonoOdometry(street.camera, MonoOdometryOptions(detector=DETECTOR))
     odometry.step(street.images(0)[0])

@@ -21,6 +21,7 @@ from vojax.lie import SE3
 from ._absolute_motion import AbsoluteMotionOptions, absolute_motion
 from ._bootstrap import Bootstrap, BootstrapOptions, Start
 from ._frame import Flag, FrameEstimate
+from ._image_checks import ImageChecks, image_flags, track_flags
 from ._keyframes import KeyframeOptions, is_keyframe
 from ._mono_window import MonoKeyframe, MonoWindow, MonoWindowOptions
 from ._planar_motion import PlanarMotionOptions, planar_motion
@@ -42,6 +43,7 @@ class MonoOdometryOptions:
         max_bridged: After more frames in a row than this the pipeline starts anew.
         detector: Corners that are tracked, or (`DescriptorOptions`) features that are matched.
         tracker: From frame to frame; not read where features are matched.
+        checks: When a frame is flagged.
         bootstrap: The first motion.
         absolute: Motion from landmarks.
         relative: Motion from an essential matrix.
@@ -57,6 +59,7 @@ class MonoOdometryOptions:
     max_bridged: int = 3
     detector: DetectorOptions | DescriptorOptions = DetectorOptions(max_features=800)
     tracker: TrackerOptions = TrackerOptions()
+    checks: ImageChecks = ImageChecks()
     bootstrap: BootstrapOptions = BootstrapOptions()
     absolute: AbsoluteMotionOptions = AbsoluteMotionOptions()
     relative: RelativeMotionOptions = RelativeMotionOptions()
@@ -127,7 +130,7 @@ class MonoOdometry:
                 f"{before.shape[1]}×{before.shape[0]}: a sequence has one size"
             )
         features = self._tracks.step(gray, previous, self._predicted)
-        estimate = self._take(features)
+        estimate = self._take(features, image_flags(gray, len(features.pixels), self._options.checks))
         self._predicted = self._predict(features)
         return estimate
 
@@ -146,10 +149,16 @@ class MonoOdometry:
         """
         features, _ = given_features(ids, pixels, self._features)
         self._size = room_for(len(features.ids), self._size)
-        return self._take(features)
+        few = len(features.ids) < self._options.checks.min_features
+        return self._take(features, (Flag.texture,) if few else ())
 
-    def _take(self, features: Features) -> FrameEstimate:
-        previous = self._features
+    def _take(self, features: Features, about_image: tuple[Flag, ...]) -> FrameEstimate:
+        """A frame by its features; a flag does not change what becomes of it, and is never passed over."""
+        previous, flags = self._features, about_image
+        # An image without content shares nothing with any other: no news.
+        if previous is not None and not about_image:
+            before, now = previous.pixels[features.rows], features.pixels[: len(features.rows)]
+            flags = track_flags(before, now, len(previous.ids), self._options.checks)
         if previous is None:
             self._begin()
             self._add_to_bootstrap(features)
@@ -160,7 +169,7 @@ class MonoOdometry:
             estimate = self._follow(previous, features)
         self._features, self._skipped = features, 0
         self._count += 1
-        return estimate
+        return dataclasses.replace(estimate, flags=(*flags, *estimate.flags)) if flags else estimate
 
     def skip(self) -> FrameEstimate:
         """Bridge a frame that cannot be read: the last motion is repeated, and tracks go on from the image before."""
