@@ -1,7 +1,7 @@
 """How drift grows with distance, with and without a sensor of absolute orientation.
 
-Claim: errors of orientation make the position error grow faster than the distance; with an absolute orientation it grows
-no faster than it (Olson, Matthies, Schoppers & Maimone, "Rover navigation using stereo ego-motion", 2003).
+Claim: errors of orientation make the position error grow faster than the distance; with an absolute orientation it
+grows no faster than it (Olson, Matthies, Schoppers & Maimone, "Rover navigation using stereo ego-motion", 2003).
 
 A camera goes straight on, a metre a step. Every relative pose has Gaussian noise in its camera-frame tangent; the prior
 is an absolute orientation with white noise and a constant error of its mounting, fused by a Kalman gain in its steady
