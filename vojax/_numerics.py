@@ -169,3 +169,13 @@ def symmetric_inverse(
     # The trace of the scaled inverse bounds its largest eigenvalue.
     trace = sum(matrix[i, i] * inverse[i, i] for i in range(matrix.shape[0]))
     return inverse, regular & (trace < 1.0 / (32.0 * float(jnp.finfo(matrix.dtype).eps)))
+
+
+def propagated(jacobian: Float[Array, "*n i j"], covariance: Float[Array, "n j j"]) -> Float[Array, "n i i"]:
+    """J Σ Jᵀ of each row of a batch on the first axis; one Jacobian `[i, j]` serves all rows.
+
+    Sums instead of matrix products: of small matrices XLA makes one kernel.
+    """
+    jacobian = jnp.broadcast_to(jacobian, (covariance.shape[0], *jacobian.shape[-2:]))
+    half = jnp.sum(jacobian[:, :, :, None] * covariance[:, None], axis=2)
+    return jnp.sum(half[:, :, None, :] * jacobian[:, None, :, :], axis=3)

@@ -30,18 +30,14 @@ class Demo:
     """Of the street and of the random sampling; the same seed gives the same path."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """Estimate the path of a camera from a recorded sequence, and compare it with the truth where that is known."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recording:
+    """What `run` and `compare` take alike: the images, and how they are followed."""
 
     path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the data set; for images a folder of them, or a video file."""
     dataset: Literal["kitti", "tum", "euroc", "7scenes", "images"]
     """Layout of that folder."""
-    pipeline: Annotated[str, tyro.conf.arg(metavar="NAME")]
-    """How to estimate, such as stereo-3d2d; an unknown name lists them all."""
-    out: pathlib.Path
-    """Folder for the results; made where it does not exist."""
     sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Of KITTI the sequence, such as 06; elsewhere a folder inside PATH."""
     calibration: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -56,36 +52,28 @@ class Run:
     """Stop after this many frames."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Of the random sampling; the same seed and images give the same path."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run(Recording):
+    """Estimate the path of a camera from a recorded sequence, and compare it with the truth where that is known."""
+
+    pipeline: Annotated[str, tyro.conf.arg(metavar="NAME")]
+    """How to estimate, such as stereo-3d2d; an unknown name lists them all."""
+    out: pathlib.Path
+    """Folder for the results; made where it does not exist."""
     rerun: Annotated[tuple[pathlib.Path, ...] | None, tyro.conf.arg(metavar="[FILE.rrd]")] = None
     """Show the run in the rerun viewer, or record it into a file."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Compare:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Compare(Recording):
     """Run several pipelines on a recorded sequence, one after the other, and put their numbers into one table."""
 
-    path: Annotated[pathlib.Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
-    """Folder of the data set; for images a folder of them, or a video file."""
-    dataset: Literal["kitti", "tum", "euroc", "7scenes", "images"]
-    """Layout of that folder."""
     pipelines: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME …")]
     """Which pipelines, such as mono-3d2d stereo-3d2d; an unknown name lists them all."""
     out: pathlib.Path
     """Folder for the table; the results of each pipeline are in a folder of its name inside."""
-    sequence: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Of KITTI the sequence, such as 06; elsewhere a folder inside PATH."""
-    calibration: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Camera file (OpenCV, Kalibr, EuRoC, KITTI or COLMAP): images need one, TUM and 7-Scenes may have another one."""
-    camera_name: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
-    """Which camera of that file; needed where it has several."""
-    features: Annotated[str, tyro.conf.arg(metavar="NAME")] = "corners"
-    """Corners that are tracked; or sift, orb … (what the installed OpenCV has), matched by their descriptors."""
-    window: Literal["auto", "on", "off"] = "auto"
-    """Adjust the last keyframes together; auto does what was measured to be better for the pipeline."""
-    max_frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Stop after this many frames."""
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Of the random sampling; the same seed and images give the same paths."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import propagated
 from vojax._types import Array, Bool, Float, Int
 from vojax.ba import GemanMcClure, LMOptions, refine_absolute_pose
 from vojax.cameras import Camera
@@ -77,8 +78,7 @@ def absolute_motion(
         """Covariance of the pixels, that of the landmarks carried into the image."""
         project = jax.jacfwd(lambda point: camera.project(pose.apply(point)))
         jacobian = jax.vmap(project)(points0)  # [n, 2, 3]
-        carried = jnp.sum(jacobian[:, :, :, None] * covariances0[:, None], axis=2)
-        carried = jnp.sum(carried[:, :, None, :] * jacobian[:, None, :, :], axis=3)
+        carried = propagated(jacobian, covariances0)
         return carried + options.sigma_px**2 * jnp.eye(2, dtype=carried.dtype)[None]
 
     def refine(pose: SE3, _: None) -> tuple[SE3, Array]:

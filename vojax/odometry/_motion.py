@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import symmetric_inverse
+from vojax._numerics import propagated, symmetric_inverse
 from vojax._types import Array, Bool, Float, Int
 from vojax.ba import GemanMcClure, LMOptions, refine_absolute_pose
 from vojax.cameras import RectifiedStereo
@@ -221,9 +221,7 @@ class TransferResiduals(eqx.Module):
         """Of the residuals, Σ_k + J Σ_{k−1} Jᵀ; and J."""
         noise0, noise1 = self.noise()
         jacobian = jax.vmap(jax.jacfwd(lambda m: self.predict(pose, m)))(self.first)
-        carried = jnp.sum(jacobian[:, :, :, None] * noise0[:, None], axis=2)
-        carried = jnp.sum(carried[:, :, None, :] * jacobian[:, None, :, :], axis=3)
-        return noise1 + carried, jacobian
+        return noise1 + propagated(jacobian, noise0), jacobian
 
     def conclude(
         self,

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import symmetric_inverse
+from vojax._numerics import propagated, symmetric_inverse
 from vojax._types import Array, Float
 from vojax.ba import GemanMcClure
 from vojax.cameras import RectifiedStereo
@@ -134,8 +134,7 @@ def point_covariances(
 ) -> Float[Array, "n 3 3"]:
     """Covariances of triangulated points to first order, J Σ Jᵀ."""
     jacobian = jax.vmap(jax.jacfwd(stereo.unproject))(measurements)
-    covariance = jnp.sum(jacobian[:, :, :, None] * noise[:, None], axis=2)
-    covariance = jnp.sum(covariance[:, :, None, :] * jacobian[:, None, :, :], axis=3)
+    covariance = propagated(jacobian, noise)
     # Longer than float32 can invert is cut: across the ray a point is not more certain than a part of its depth.
     across = covariance[:, 2, 2] / _MAX_ELONGATION**2
     return covariance + across[:, None, None] * jnp.eye(3, dtype=covariance.dtype)[None]
@@ -149,9 +148,7 @@ def mahalanobis(
     covariances1: Float[Array, "n 3 3"],
 ) -> Float[Array, " n"]:
     """Squared distances of aligned points, eᵀ (C₁ + R C₀ Rᵀ)⁻¹ e."""
-    rotation = pose.rotation().as_matrix()
-    turned = jnp.sum(rotation[None, :, :, None] * covariances0[:, None], axis=2)
-    turned = jnp.sum(turned[:, :, None, :] * rotation[None, None], axis=3)
+    turned = propagated(pose.rotation().as_matrix(), covariances0)
     information = symmetric_inverse(jnp.moveaxis(covariances1 + turned, 0, -1))[0]
     e = jnp.moveaxis(points1 - pose.apply(points0), 1, 0)
     return jnp.sum(jnp.sum(information * e[None], axis=1) * e, axis=0)

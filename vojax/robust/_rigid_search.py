@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from vojax._numerics import propagated
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from vojax.ba import GemanMcClure, RigidProblem, polish_model, whitening
 from vojax.lie import SE3
@@ -79,8 +80,7 @@ class UncertainAlignmentEstimator(eqx.Module):
 
         def step(model: Array, widening: Array) -> tuple[Array, None]:
             rotation = model.reshape(3, 4)[:, :3]
-            turned = jnp.sum(rotation[None, :, :, None] * self.covariances0[:, None], axis=2)
-            turned = jnp.sum(turned[:, :, None, :] * rotation[None, None], axis=3)
+            turned = propagated(rotation, self.covariances0)
             noise = whitening(self.covariances1 + turned, (mask.shape[0],), 3, model.dtype)
             refined = polish_model(
                 motion_of_entries(model, with_scale=False),
