@@ -3,6 +3,7 @@
 import json
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -91,8 +92,12 @@ def test_fisheye_models(data_root, x64):
         flags=cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS,
     )  # fmt: skip
     assert float(found.rms_px) <= rms + 1e-6
-    polynomial = calibrate(corners, board, (width, height), model=Scaramuzza)
-    assert float(polynomial.rms_px) <= 1.1 * float(found.rms_px)
+    # Four terms fit this lens 12 % worse than Kannala and Brandt's five, a fifth one fits it better.
+    four = calibrate(corners, board, (width, height), model=Scaramuzza)
+    assert float(four.rms_px) <= 1.15 * float(found.rms_px)
+    start = Scaramuzza(**{name: getattr(four.camera, name) for name in (*four.names, "e")}, higher=(0.0,))
+    five = calibrate(corners, board, (width, height), model=start)
+    assert float(five.rms_px) <= float(found.rms_px)
 
 
 def aprilgrid(folder):
@@ -135,7 +140,8 @@ def test_reference_optima_of_an_april_grid(data_root, x64, name, model, extra):
         jnp.asarray(corners), jnp.asarray(points), jnp.asarray(mask, float), jnp.ones(mask.shape), Squared(), ()
     )
     rig = SE3(jnp.stack([SE3.identity().wxyz_xyz, rig_from_cam.inverse().wxyz_xyz]))
-    start = BoardState(model(*map(jnp.asarray, values.T)), rig, found.rig_from_board)
+    cameras = jax.vmap(lambda row: model(*row))(jnp.asarray(values))
+    start = BoardState(cameras, rig, found.rig_from_board)
     least = adjust_board(start, data, CALIBRATION_OPTIONS)[0]
     assert float(found.cost) <= float(cost(least, data)) * (1 + 1e-9)
     names = ("fx", "fy", "cx", "cy", *extra)

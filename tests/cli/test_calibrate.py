@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from vojax.cameras import Pinhole, read_cameras
+
 BOARD = (6, 5)
 SQUARE_PX = 60
 
@@ -58,8 +60,29 @@ def test_a_camera_is_calibrated_and_what_fails_is_named(vojax_command, folder, t
     assert [left["image"].rsplit("/", 1)[-1] for left in report["left_out"]] == ["blank.png", "broken.png"]
     assert report["dtype"] == "float64"
     assert (tmp_path / "out" / "residuals.png").read_bytes()[:4] == b"\x89PNG"
+    cameras = read_cameras(tmp_path / "out" / "cameras.yaml")
+    assert cameras.sizes == {"cam0": (640, 480)}
+    assert float(cameras["cam0"].fx) == pytest.approx(camera["parameters"]["fx"], rel=1e-6)
     for word in ("fx", "±", "RMS", "left out", "blank.png", "broken.png", str(tmp_path / "out")):
         assert word in outcome.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("form", "name"), [("opencv", "cameras.yaml"), ("colmap", "cameras.txt")])
+def test_the_camera_in_another_format(vojax_command, folder, tmp_path, form, name):
+    outcome = command(vojax_command, folder, out=tmp_path / "out", model="pinhole", format=form)
+    assert (outcome.status, outcome.stderr) == (0, "")
+    (camera,) = read_cameras(tmp_path / "out" / name).cameras.values()
+    assert isinstance(camera, Pinhole)
+    assert abs(float(camera.fx) - 600.0) < 1.0
+
+
+@pytest.mark.slow
+def test_a_format_that_cannot_hold_the_camera(vojax_command, folder, tmp_path):
+    outcome = command(vojax_command, folder, out=tmp_path / "out", model="scaramuzza", format="kalibr")
+    assert (outcome.status, outcome.stderr) == (0, "")
+    assert "vojax' own format instead of kalibr" in outcome.stdout
+    assert float(read_cameras(tmp_path / "out" / "cameras.yaml")["cam0"].a0) > 0
 
 
 def one_line(outcome, *words):

@@ -2,7 +2,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from vojax.solvers._components import quaternion_from_rotation
 from vojax.solvers._svd3 import svd3
 
 decompose = jax.jit(lambda a: svd3([[a[i, j] for j in range(3)] for i in range(3)]))
@@ -45,3 +47,25 @@ def test_infinite_input_stays_outside_the_other_lanes():
     a = np.stack([np.full((3, 3), np.nan), np.eye(3)], axis=-1).astype(np.float32)
     _, s, _ = decompose(a)
     np.testing.assert_allclose(np.asarray(s)[:, 1], 1.0, atol=1e-6)
+
+
+def test_the_rotation_nearest_to_a_multiple_of_one(dtype):
+    # Columns of equal length: which is called longer must be the same for all that is computed from it, in a program
+    # that uses the factors several times.
+    rng = np.random.default_rng(1)
+    rotations = np.linalg.qr(rng.normal(size=(20_000, 3, 3)))[0]
+    rotations *= np.linalg.det(rotations)[:, None, None]
+    scale = rng.uniform(0.1, 10.0, 20_000)
+
+    @jax.jit
+    def nearest(a):
+        u, s, v = svd3([[a[i, j] for j in range(3)] for i in range(3)])
+        r = [[u[0][i] * v[0][j] + u[1][i] * v[1][j] + u[2][i] * v[2][j] for j in range(3)] for i in range(3)]
+        return jnp.stack([jnp.stack(row) for row in r]), (s[0] + s[1] + s[2]) / 3.0, quaternion_from_rotation(r)
+
+    found, mean, quaternion = nearest(np.moveaxis(scale[:, None, None] * rotations, 0, -1).astype(dtype))
+    tolerance = 2e-6 if dtype == jnp.float32 else 1e-14
+    assert np.abs(np.moveaxis(np.asarray(found), -1, 0) - rotations).max() < tolerance
+    np.testing.assert_allclose(mean, scale, rtol=tolerance)
+    expected = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    assert np.abs(np.abs(np.sum(np.stack(quaternion, axis=-1) * expected, axis=1)) - 1.0).max() < tolerance

@@ -131,6 +131,8 @@ class Calibrate:
         "spherical",
     ] = "brown-conrady"  # fmt: skip
     """Camera model."""
+    format: Literal["vojax", "opencv", "kalibr", "euroc", "colmap"] = "vojax"
+    """Of the camera file."""
     dtype: Literal["float64", "float32"] = "float64"
     """Precision."""
 

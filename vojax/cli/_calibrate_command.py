@@ -55,9 +55,10 @@ def execute(command: Calibrate) -> None:
                 "the focal length open: take images of the board at different angles, 20 degrees and more"
             )
         report = _report(found, views, mask, command, seconds)
-    write_json(command.out / "report.json", report)
+        write_json(command.out / "report.json", report)
+        camera_file = _write_cameras(found, views, command, console)
     _draw(found, views, mask, command, report)
-    _print(console, report, command)
+    _print(console, report, command, camera_file)
 
 
 def _board_size(text: str) -> tuple[int, int]:
@@ -250,6 +251,26 @@ def _report(found: Any, views: _Views, mask: Any, command: Calibrate, seconds: f
     return report
 
 
+def _write_cameras(found: Any, views: _Views, command: Calibrate, console: Any) -> str:
+    """Write the cameras for `read_cameras` and others; what a format cannot hold is written in vojax' own."""
+    from vojax.cameras import CameraSet, write_cameras
+
+    from ._report import print_line
+
+    cameras = found.rig.cameras if hasattr(found, "rig") else (found.camera,)
+    named = {f"cam{i}": camera for i, camera in enumerate(cameras)}
+    poses = found.rig.cam_from_rig if hasattr(found, "rig") else None
+    cameras = CameraSet(named, dict.fromkeys(named, views.image_size), poses)
+    name = "cameras.txt" if command.format == "colmap" else "cameras.yaml"
+    try:
+        write_cameras(command.out / name, cameras, format=command.format)
+    except ValueError as error:
+        name = "cameras.yaml"
+        print_line(console, f"warning: {error}: {name} is in vojax' own format instead of {command.format}")
+        write_cameras(command.out / name, cameras)
+    return name
+
+
 def _number(camera: Any, name: str) -> float:
     from vojax.ba._intrinsics import get_attribute
 
@@ -280,7 +301,7 @@ def _draw(found: Any, views: _Views, mask: Any, command: Calibrate, report: dict
         save_figure(figure, command.out / name)
 
 
-def _print(console: Any, report: dict[str, Any], command: Calibrate) -> None:
+def _print(console: Any, report: dict[str, Any], command: Calibrate, camera_file: str) -> None:
     from rich.table import Table
 
     from ._report import print_line
@@ -304,4 +325,7 @@ def _print(console: Any, report: dict[str, Any], command: Calibrate) -> None:
     if report["unconstrained"]:
         print_line(console, f"warning: the views do not constrain {', '.join(report['unconstrained'])}")
     print_line(console, report["result"])
-    print_line(console, f"in {command.out}: report.json, residuals{'' if len(report['cameras']) == 1 else '0'}.png")
+    print_line(
+        console,
+        f"in {command.out}: {camera_file}, report.json, residuals{'' if len(report['cameras']) == 1 else '0'}.png",
+    )

@@ -39,8 +39,11 @@ def svd3(matrix: Sequence[Sequence[Array]]) -> tuple[Rows3, tuple[Array, Array, 
     a = tuple((matrix[0][j] / scale, matrix[1][j] / scale, matrix[2][j] / scale) for j in range(3))
     v = ((one, zero, zero), (zero, one, zero), (zero, zero, one))
 
-    def sweep(_: object, columns: tuple[Rows3, Rows3]) -> tuple[Rows3, Rows3]:
-        a, v = (list(c) for c in columns)
+    # Which column is longer must be one decision for all that follows from it. Computed after the loop it would be
+    # compiled once for each use, with roundings of its own: of columns of equal length, as a rotation has, two could
+    # both end up in one place. What a loop carries is stored, and the same for all.
+    def sweep(_: object, state: tuple[Rows3, Rows3, Vector3]) -> tuple[Rows3, Rows3, Vector3]:
+        a, v = (list(c) for c in state[:2])
         for p, q in ((0, 1), (0, 2), (1, 2)):
             gamma = 2.0 * dot3(a[p], a[q])
             delta = squared(a[q]) - squared(a[p])
@@ -51,15 +54,16 @@ def svd3(matrix: Sequence[Sequence[Array]]) -> tuple[Rows3, tuple[Array, Array, 
             sine = tangent * cosine
             for c in (a, v):
                 c[p], c[q] = _mix(cosine, c[p], -sine, c[q]), _mix(sine, c[p], cosine, c[q])
-        return (a[0], a[1], a[2]), (v[0], v[1], v[2])
+        return (a[0], a[1], a[2]), (v[0], v[1], v[2]), (squared(a[0]), squared(a[1]), squared(a[2]))
 
     sweeps = 6 if scale.dtype == jnp.float64 else 5
-    a, v = jax.lax.fori_loop(0, sweeps, sweep, (a, v))
+    a, v, lengths = jax.lax.fori_loop(0, sweeps, sweep, (a, v, (zero, zero, zero)))
 
     # Longest first; an exchange negates one of the two columns, so that V stays a rotation.
-    a, v = list(a), list(v)
+    a, v, lengths = list(a), list(v), list(lengths)
     for p, q in ((0, 1), (0, 2), (1, 2)):
-        exchange = squared(a[p]) < squared(a[q])
+        exchange = lengths[p] < lengths[q]
+        lengths[p], lengths[q] = jnp.maximum(lengths[p], lengths[q]), jnp.minimum(lengths[p], lengths[q])
         for c in (a, v):
             c[p], c[q] = (
                 _where(exchange, c[q], c[p]),
