@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vojax._numerics import Vector3, cross3, dot3, lane_sum
 from vojax._types import Array, Bool, Float
@@ -56,24 +57,20 @@ def polish_essential(
         0, steps, lambda _, motion: newton_motion(motion[0], motion[1], rays0, rays1), motion_from_essential(entries)
     )
     entries = essential_entries(q, t)
-    residual = jnp.zeros_like(t[0])
-    for i in range(5):
-        image = [sum(entries[3 * r + c] * rays0[i, c][None] for c in range(3)) for r in range(3)]
-        residual = jnp.maximum(residual, jnp.abs(sum(rays1[i, r][None] * image[r] for r in range(3))))
+    e = entries.reshape(3, 3, 1, *entries.shape[1:])
+    images = lane_sum(e * jnp.moveaxis(rays0, 1, 0)[None, :, :, None], axis=1)  # [3, 5, s, *lanes]
+    residual = jnp.max(jnp.abs(lane_sum(images * jnp.moveaxis(rays1, 1, 0)[:, :, None], axis=0)), axis=0)
     valid = valid & (residual <= 256.0 * eps)
     # Two candidates may come to the same solution: told by two numbers that do not depend on the sign of E.
     first = sum_of_products(_WEIGHTS, list(entries))
     second = sum_of_products(_WEIGHTS, list(entries[::-1]))
     marks = jnp.stack([first * first, first * second])
-    kept = [valid[0]]
-    for later in range(1, entries.shape[1]):
-        twice = jnp.zeros_like(valid[0])
-        for earlier in range(later):
-            gap = jnp.max(jnp.abs(marks[:, later] - marks[:, earlier]), axis=0)
-            twice = twice | (kept[earlier] & (gap < 2.0 * eps**0.5))
-        kept.append(valid[later] & ~twice)
+    gap = jnp.max(jnp.abs(marks[:, :, None] - marks[:, None]), axis=0)  # [s, s, *lanes]
+    slots = np.arange(entries.shape[1])
+    earlier = jnp.asarray(slots[:, None] > slots[None]).reshape(gap.shape[:2] + (1,) * (gap.ndim - 2))
+    valid = valid & ~jnp.any(earlier & valid[None] & (gap < 2.0 * eps**0.5), axis=1)
     matrices, proper = unit_matrix(entries.reshape(3, 3, *entries.shape[1:]))
-    valid = jnp.stack(kept) & proper
+    valid = valid & proper
     matrices = jnp.where(valid[None, None], matrices, 0.0)
     return jnp.moveaxis(matrices, 2, 0), valid
 
