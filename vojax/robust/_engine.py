@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 
 from vojax._types import Array, Bool, Float, Int
 
@@ -74,7 +75,10 @@ def search(
     key: Any,
     options: RansacOptions,
 ) -> Consensus:
-    """Find the model with the lowest truncated error.
+    """Find the model with the lowest truncated error; for a batch on a CPU one problem after the other.
+
+    In lock-step every problem would take the samples of the hardest, and the branch of the local optimisation always.
+    One solve of a chunk fills the lanes of a core; cores are for `jax.shard_map`. A GPU takes the batch at once.
 
     Args:
         estimator: What is estimated from what.
@@ -86,6 +90,35 @@ def search(
     Returns:
         The polished consensus. Without any valid hypothesis the model is zero and nothing is an inlier.
     """
+
+    def alone(arguments: Any) -> Consensus:
+        estimator, mask, quality, key = arguments
+        return _search(estimator, mask, quality, key, options)
+
+    one = custom_vmap(alone)
+
+    @one.def_vmap
+    def _(axis_size: int, batched: list[Any], arguments: Any) -> tuple[Consensus, Any]:
+        def problem(i: Array) -> Any:
+            return jax.tree.map(lambda x, is_batched: x[i] if is_batched else x, arguments, batched[0])
+
+        if jax.default_backend() == "cpu":
+            found = jax.lax.map(lambda i: one(problem(i)), jnp.arange(axis_size))
+        else:
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched[0])
+            found = jax.vmap(alone, in_axes=(axes,))(arguments)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return one((estimator, mask, quality, key))
+
+
+def _search(
+    estimator: Estimator,
+    mask: Bool[Array, " n"],
+    quality: Float[Array, " n"] | None,
+    key: Any,
+    options: RansacOptions,
+) -> Consensus:
     n = mask.shape[0]
     m, k = estimator.sample_size, min(options.chunk_size or estimator.chunk_size, options.max_hypotheses)
     dtype = estimator.observations[0].dtype

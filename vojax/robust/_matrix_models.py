@@ -125,7 +125,7 @@ def estimate_fundamental(
     pixels1: Float[ArrayLike, "n 2"],
     *,
     key: PRNGKeyArray | Array,
-    options: RansacOptions = RansacOptions(threshold_px=1.5),
+    options: RansacOptions = RansacOptions(threshold_px=1.5, max_hypotheses=16384),
     sigma_px: Float[ArrayLike, "..."] | float = 1.0,
     quality: Float[ArrayLike, " n"] | None = None,
     mask: Bool[ArrayLike, " n"] | None = None,
