@@ -42,6 +42,7 @@ from ._model_refinement import refine_model as refine_model
 from ._refinement import Refinement as Refinement
 from ._refinement import polish_absolute_pose as polish_absolute_pose
 from ._refinement import refine_absolute_pose as refine_absolute_pose
+from ._retraction import step_rotation as step_rotation
 from ._rig_pose import LocalRigPoseProblem as LocalRigPoseProblem
 from ._rig_pose import RigPoseProblem as RigPoseProblem
 from ._rig_pose import local_error as local_error

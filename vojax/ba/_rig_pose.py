@@ -10,6 +10,7 @@ from vojax._types import Array, Float, Int
 from vojax.cameras import Rig
 from vojax.lie import SE3
 
+from ._retraction import step_pose
 from ._whitening import whiten
 
 
@@ -26,7 +27,7 @@ class RigPoseProblem(eqx.Module):
     @staticmethod
     def retract(model: SE3, tangent: Array) -> SE3:
         """exp(−ξ) @ rig_from_world."""
-        return (SE3.exp(-tangent) @ model).normalize()
+        return step_pose(model, tangent)
 
     def residual(self, model: SE3) -> tuple[Array, ...]:
         """Whitened reprojection errors."""

@@ -21,6 +21,8 @@ from vojax._numerics import complement, cross3, dot3, safe_divide, safe_sqrt
 from vojax._types import Array, Float
 from vojax.lie import SE3
 
+from ._retraction import step_pose
+
 Components = tuple[Array, ...]
 
 
@@ -36,19 +38,26 @@ class PixelRays(eqx.Module):
         """All nine, in order."""
         return (*self.ray, *self.by_u, *self.by_v)
 
+    def scaled(self, factor: Float[Array, "n 2 2"]) -> "PixelRays":
+        """With other noise, from rays for a noise of one pixel.
 
-def pixel_rays(camera: Any, pixels: Float[Array, "n 2"], factor: Array) -> PixelRays:
-    """Rays of pixels and how they move by one standard deviation.
+        Args:
+            factor: Lower-triangular square roots of the covariances, px.
+        """
+        first, across, second = factor[:, 0, 0], factor[:, 1, 0], factor[:, 1, 1]
+        by_u = tuple(first * u + across * v for u, v in zip(self.by_u, self.by_v, strict=True))
+        return PixelRays(self.ray, by_u, tuple(second * v for v in self.by_v))
+
+
+def pixel_rays(camera: Any, pixels: Float[Array, "n 2"]) -> PixelRays:
+    """Rays of pixels and how they move by one pixel.
 
     Args:
         camera: A camera of `vojax.cameras`.
         pixels: Observations.
-        factor: Lower-triangular square roots of the covariances `[n, 2, 2]`, px.
     """
-    ray, along_u = jax.jvp(camera.unproject, (pixels,), (jnp.zeros_like(pixels).at[:, 0].set(1.0),))
-    _, along_v = jax.jvp(camera.unproject, (pixels,), (jnp.zeros_like(pixels).at[:, 1].set(1.0),))
-    by_u = factor[:, :1, 0] * along_u + factor[:, 1:, 0] * along_v
-    by_v = factor[:, 1:, 1] * along_v
+    ray, moved = jax.linearize(camera.unproject, pixels)
+    by_u, by_v = (moved(jnp.zeros_like(pixels).at[:, k].set(1.0)) for k in range(2))
     return PixelRays(*(tuple(x[:, i] for i in range(3)) for x in (ray, by_u, by_v)))
 
 
@@ -88,9 +97,10 @@ class RelativePoseProblem(_Epipolar):
     def retract(model: SE3, tangent: Array) -> SE3:
         """Turn the translation within its plane, and the rotation."""
         basis = translation_basis(model)
-        moved = SE3.exp(-jnp.concatenate([basis @ tangent[:2], tangent[2:]])) @ model
-        wxyz, t = moved.wxyz_xyz[:4], moved.wxyz_xyz[4:]
-        return SE3(jnp.concatenate([wxyz / safe_sqrt(jnp.sum(wxyz * wxyz)), t / safe_sqrt(jnp.sum(t * t))]))
+        along = tangent[0] * basis[:, 0] + tangent[1] * basis[:, 1]
+        moved = step_pose(model, jnp.concatenate([along, tangent[2:]]))
+        t = moved.translation()
+        return SE3.from_rotation_and_translation(moved.rotation(), t / safe_sqrt(jnp.sum(t * t)))
 
     def residual(self, model: SE3) -> tuple[Array, ...]:
         """Sampson distances."""
@@ -128,11 +138,14 @@ def _cofactors(m: Array) -> Array:
 
 def to_rank_two(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The matrix of rank two and norm one near a matrix near it."""
-    for _ in range(3):
+
+    def newton(_: object, matrix: Array) -> Array:
         gradient = _cofactors(matrix)
         determinant = jnp.sum(matrix[0] * gradient[0])
         length = jnp.sum(gradient * gradient)
-        matrix = matrix - gradient * safe_divide(determinant, length)
+        return matrix - gradient * safe_divide(determinant, length)
+
+    matrix = jax.lax.fori_loop(0, 3, newton, matrix)
     return matrix * safe_divide(jnp.ones_like(matrix[0, 0]), safe_sqrt(jnp.sum(matrix * matrix)))
 
 

@@ -84,7 +84,7 @@ def planar_motion(
     pose, inliers = arc_motion(vote.theta, forward, up), vote.inliers & vote.valid
     if options.refine:
         noise = jnp.broadcast_to(options.sigma_px * jnp.eye(2, dtype=pixels0.dtype), (*usable.shape, 2, 2))
-        problem = RelativePoseProblem(*(pixel_rays(camera, pixels, noise) for pixels in (pixels0, pixels1)))
+        problem = RelativePoseProblem(*(pixel_rays(camera, pixels).scaled(noise) for pixels in (pixels0, pixels1)))
         refined = refine_model(
             pose,
             problem,

@@ -18,7 +18,6 @@ from ._noise_scale import NoiseScale as NoiseScale
 from ._noise_scale import noise_scale as noise_scale
 from ._options import RansacOptions as RansacOptions
 from ._relative_pose import estimate_relative_pose as estimate_relative_pose
-from ._relative_pose import search_relative_pose as search_relative_pose
 from ._rigid_search import search_rigid as search_rigid
 from ._rigid_search import weighted_alignment as weighted_alignment
 from ._rigid_search import weighted_covariances as weighted_covariances

@@ -32,6 +32,7 @@ class AbsolutePoseEstimator(eqx.Module):
     camera: Any
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=12)
     sample_size: int = eqx.field(static=True, default=3)
     chunk_size: int = eqx.field(static=True, default=512)
 

@@ -47,6 +47,7 @@ class AlignmentEstimator(eqx.Module):
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
     with_scale: bool = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=12)
     sample_size: int = eqx.field(static=True, default=3)
     chunk_size: int = eqx.field(static=True, default=512)
 

@@ -24,6 +24,7 @@ from vojax.ba import (
     homography_residual,
     polish_model,
     refine_model,
+    step_rotation,
 )
 from vojax.lie import SO3
 from vojax.solvers import rotation_from_rays, unit_matrix
@@ -38,6 +39,7 @@ from ._pairs import (
     masked_pairs,
     matrix_lanes,
     matrix_rows,
+    noisy_rays,
     pair_rays,
     root_mean_square,
     single_precision,
@@ -75,7 +77,7 @@ class RotationProblem(eqx.Module):
     @staticmethod
     def retract(model: SO3, tangent: Array) -> SO3:
         """exp(−φ) @ cam1_from_cam0."""
-        return (SO3.exp(-tangent) @ model).normalize()
+        return step_rotation(model, tangent)
 
     def residual(self, model: SO3) -> tuple[Array, ...]:
         """Whitened Sampson residuals, two for each pair."""
@@ -91,6 +93,7 @@ class RotationEstimator(eqx.Module):
     view1: PixelRays
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=9)
     sample_size: int = eqx.field(static=True, default=2)
     chunk_size: int = eqx.field(static=True, default=128)
 
@@ -211,7 +214,7 @@ def _estimate(
     sigma_px, mask = usable_noise(sigma_px, mask)
     mask = mask & plane0.sees(pixels0) & plane1.sees(pixels1)
     dtype = pixels0.dtype
-    unit = pair_rays(pixels0, pixels1, plane0, plane1, 1.0)
+    unit = pair_rays(pixels0, pixels1, plane0, plane1)
     kind = RotationEstimator if rotates else HomographyEstimator
     estimator = kind(*single_precision(unit), limit=options.threshold_px**2, local_steps=options.local_steps)
     consensus = search(estimator, mask, single_precision(quality), key, options)
@@ -225,7 +228,7 @@ def _estimate(
     problem_kind: Any = RotationProblem if rotates else HomographyProblem
     refined = refine_model(
         start,
-        problem_kind(*pair_rays(pixels0, pixels1, plane0, plane1, sigma_px)),
+        problem_kind(*noisy_rays(unit, sigma_px)),
         weight=mask.astype(dtype),
         loss=GaussianUniform(cut),
         options=LMOptions(max_steps=options.final_steps),

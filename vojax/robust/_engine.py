@@ -27,8 +27,9 @@ _PROMISING = 0.8
 
 @runtime_checkable
 class Estimator(Protocol):
-    """A kind of model, with the observations it is estimated from. A pytree; models are vectors of `d` numbers."""
+    """A kind of model, a vector of `model_size` numbers, with the observations it is estimated from; a pytree."""
 
+    model_size: int
     sample_size: int
     chunk_size: int
     limit: float
@@ -171,9 +172,8 @@ def _search(
     def unfinished(state: _State) -> Array:
         return (state.chunk < num_chunks) & (state.chunk * k < state.required) & (count >= m)
 
-    d = jax.eval_shape(estimator.hypothesize, jax.ShapeDtypeStruct((m, k), jnp.int32))[0].shape[0]
     endless = jnp.asarray(jnp.inf, dtype)
-    start = _State(jnp.zeros((), jnp.int32), jnp.zeros((d,), dtype), endless, endless, endless)
+    start = _State(jnp.zeros((), jnp.int32), jnp.zeros((estimator.model_size,), dtype), endless, endless, endless)
     state = jax.lax.while_loop(unfinished, body, start)
     found = jnp.isfinite(state.score)
     model = jnp.where(found, state.model, 0.0)

@@ -52,6 +52,7 @@ class GeneralizedPoseEstimator(eqx.Module):
     bearings: Float[Array, "n 3"]
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=12)
     sample_size: int = eqx.field(static=True, default=3)
     chunk_size: int = eqx.field(static=True, default=128)
 

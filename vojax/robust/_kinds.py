@@ -86,14 +86,14 @@ def _generalized_pose(points_world: Any, pixels: Any, camera_index: Any, rig: Ri
 
 def _relative_pose(pixels0: Any, pixels1: Any, camera0: Any, camera1: Any) -> Judge:
     pixels0, pixels1, mask = masked_pairs(*checked_pairs(pixels0, pixels1, 1, "a score"), None)
-    return _of(RelativePoseEstimator(*pair_rays(pixels0, pixels1, camera0, camera1, 1.0), **_SEARCH), mask)
+    return _of(RelativePoseEstimator(*pair_rays(pixels0, pixels1, camera0, camera1), **_SEARCH), mask)
 
 
 def _matrix(estimator: Any) -> Callable[..., Judge]:
     def judge(pixels0: Any, pixels1: Any) -> Judge:
         pixels0, pixels1, mask = masked_pairs(*checked_pairs(pixels0, pixels1, 1, "a score"), None)
         plane = Plane(jnp.zeros((2,), pixels0.dtype), jnp.ones((), pixels0.dtype))
-        return _of(estimator(*pair_rays(pixels0, pixels1, plane, plane, 1.0), **_SEARCH), mask)
+        return _of(estimator(*pair_rays(pixels0, pixels1, plane, plane), **_SEARCH), mask)
 
     return judge
 

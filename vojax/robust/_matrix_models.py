@@ -38,6 +38,7 @@ from ._pairs import (
     checked_pairs,
     masked_pairs,
     matrix_rows,
+    noisy_rays,
     normalising_plane,
     pair_rays,
     root_mean_square,
@@ -54,6 +55,7 @@ class FundamentalEstimator(eqx.Module):
     view1: PixelRays
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=9)
     sample_size: int = eqx.field(static=True, default=7)
     chunk_size: int = eqx.field(static=True, default=256)
 
@@ -87,6 +89,7 @@ class HomographyEstimator(eqx.Module):
     view1: PixelRays
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=9)
     sample_size: int = eqx.field(static=True, default=4)
     chunk_size: int = eqx.field(static=True, default=512)
 
@@ -250,7 +253,7 @@ def _estimate(
 ) -> Estimate[Array]:
     estimator_kind, problem_kind, onto, from_pixels, basis = kind
     plane0, plane1 = normalising_plane(pixels0, mask), normalising_plane(pixels1, mask)
-    unit = pair_rays(pixels0, pixels1, plane0, plane1, 1.0)
+    unit = pair_rays(pixels0, pixels1, plane0, plane1)
     estimator = estimator_kind(*single_precision(unit), limit=options.threshold_px**2, local_steps=options.local_steps)
     consensus = search(estimator, mask, single_precision(quality), key, options)
     start = onto(consensus.model.astype(pixels0.dtype).reshape(3, 3))
@@ -259,7 +262,7 @@ def _estimate(
     cut = even_odds(jnp.sum(consensus.inliers), jnp.sum(mask), densities[0] / sigma**dimension, densities[1])
     refined = refine_model(
         start,
-        problem_kind(*pair_rays(pixels0, pixels1, plane0, plane1, sigma_px)),
+        problem_kind(*noisy_rays(unit, sigma_px)),
         weight=mask.astype(pixels0.dtype),
         loss=GaussianUniform(cut),
         options=LMOptions(max_steps=options.final_steps),

@@ -34,7 +34,7 @@ from ._calibrated_plane import ImagePlane, RotationProblem, estimate_calibrated_
 from ._estimate import Estimate
 from ._noise_scale import noise_scale
 from ._options import RansacOptions
-from ._pairs import check_sigma, checked_pairs, masked_pairs, pair_rays, root_mean_square, usable_noise
+from ._pairs import check_sigma, checked_pairs, masked_pairs, noisy_rays, pair_rays, root_mean_square, usable_noise
 from ._relative_pose import estimate_relative_pose, in_front
 from ._significance import chance_near_line, is_significant
 
@@ -145,9 +145,9 @@ def _select(
     dtype = pixels0.dtype
     estimates = (relative_pose, homography, rotation)
     usable = jnp.stack([(x.result == Result.success) | (x.result == Result.not_converged) for x in estimates])
-    views = pair_rays(pixels0, pixels1, camera0, camera1, sigma_px)
+    views = noisy_rays(pair_rays(pixels0, pixels1, camera0, camera1), sigma_px)
     planes = ImagePlane(camera0), ImagePlane(camera1)
-    plane_views = pair_rays(pixels0, pixels1, *planes, sigma_px)
+    plane_views = noisy_rays(pair_rays(pixels0, pixels1, *planes), sigma_px)
     forward = planes[0].sees(pixels0) & planes[1].sees(pixels1)
 
     def squared(problem: Any, model: Any, possible: Array) -> Array:

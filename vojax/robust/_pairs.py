@@ -128,10 +128,16 @@ def root_mean_square(sigma_px: Any, mask: Bool[Array, " n"]) -> Float[Array, ""]
     return jnp.sqrt(jnp.where(total > 0, total, 1.0))
 
 
-def pair_rays(pixels0: Array, pixels1: Array, camera0: Any, camera1: Any, sigma_px: Any) -> tuple[PixelRays, PixelRays]:
-    """Rays of both views with their noise."""
-    factor0, factor1 = noise_factors(sigma_px, pixels0.shape[0], pixels0.dtype)
-    return pixel_rays(camera0, pixels0, factor0), pixel_rays(camera1, pixels1, factor1)
+def pair_rays(pixels0: Array, pixels1: Array, camera0: Any, camera1: Any) -> tuple[PixelRays, PixelRays]:
+    """Rays of both views for a noise of one pixel."""
+    return pixel_rays(camera0, pixels0), pixel_rays(camera1, pixels1)
+
+
+def noisy_rays(unit: tuple[PixelRays, PixelRays], sigma_px: Any) -> tuple[PixelRays, PixelRays]:
+    """The same rays with the noise that they have."""
+    x = unit[0].ray[0]
+    factors = noise_factors(sigma_px, x.shape[0], x.dtype)
+    return unit[0].scaled(factors[0]), unit[1].scaled(factors[1])
 
 
 def checked_pairs(

@@ -22,18 +22,20 @@ from vojax.ba import (
     polish_model,
     refine_model,
 )
-from vojax.geometry import decompose_essential, essential_from_pose, pose_from_essential
+from vojax.geometry import essential_from_pose, pose_from_essential
 from vojax.lie import SE3
 from vojax.solvers import five_point
+from vojax.solvers._essential_newton import motion_from_essential
 
 from ._conclude import conclude
-from ._engine import Consensus, search
+from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
 from ._pairs import (
     checked_pairs,
     masked_pairs,
     matrix_rows,
+    noisy_rays,
     pair_rays,
     root_mean_square,
     single_precision,
@@ -49,6 +51,7 @@ class RelativePoseEstimator(eqx.Module):
     view1: PixelRays
     limit: float = eqx.field(static=True)
     local_steps: int = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=9)
     sample_size: int = eqx.field(static=True, default=5)
     chunk_size: int = eqx.field(static=True, default=128)
 
@@ -73,7 +76,8 @@ class RelativePoseEstimator(eqx.Module):
         """A few steps of reweighted Gauss–Newton on SO3 × S²."""
         problem = RelativePoseProblem(self.view0, self.view1)
         # Any of the four motions has the same epipolar geometry. The unit of the residuals is the pixel.
-        start = SE3(decompose_essential(model.reshape(3, 3)).cam1_from_cam0.wxyz_xyz[0])
+        wxyz, t = motion_from_essential(model)
+        start = SE3(jnp.stack([*wxyz, *t]))
         loss = Tukey(2.0 * self.limit**0.5)
         pose = polish_model(start, problem, weight=mask.astype(model.dtype), loss=loss, steps=self.local_steps)
         return essential_from_pose(pose).reshape(9)
@@ -138,11 +142,15 @@ def _estimate(
 ) -> Estimate[SE3]:
     pixels0, pixels1, mask = masked_pairs(pixels0, pixels1, mask)
     sigma_px, mask = usable_noise(sigma_px, mask)
-    essential, consensus = search_relative_pose(pixels0, pixels1, camera0, camera1, mask, quality, key, options)
-    view0, view1 = pair_rays(pixels0, pixels1, camera0, camera1, sigma_px)
+    unit = pair_rays(pixels0, pixels1, camera0, camera1)
+    estimator = RelativePoseEstimator(
+        *single_precision(unit), limit=options.threshold_px**2, local_steps=options.local_steps
+    )
+    consensus = search(estimator, mask, single_precision(quality), key, options)
+    view0, view1 = noisy_rays(unit, sigma_px)
     rays0, rays1 = jax.lax.stop_gradient([jnp.stack(view.ray, axis=1) for view in (view0, view1)])
     weight = consensus.inliers.astype(pixels0.dtype)
-    start, _ = pose_from_essential(jax.lax.stop_gradient(essential), rays0, rays1, weight)
+    start, _ = pose_from_essential(consensus.model.reshape(3, 3).astype(pixels0.dtype), rays0, rays1, weight)
     start = jax.lax.stop_gradient(start)
     chance = chance_near_line(pixels1, mask, options.threshold_px)
     # All observations take part in the last refinement, weighted by how likely they are inliers: cutting them off at
@@ -159,8 +167,7 @@ def _estimate(
         loss=GaussianUniform(cut),
         options=LMOptions(max_steps=options.final_steps),
     )
-    unit0, unit1 = pair_rays(pixels0, pixels1, camera0, camera1, 1.0)
-    (distance,) = RelativePoseProblem(unit0, unit1).residual(refined.model)
+    (distance,) = RelativePoseProblem(*unit).residual(refined.model)
     return conclude(
         refined.model,
         refined.covariance,
@@ -191,26 +198,3 @@ def in_front(cam1_from_cam0: SE3, view0: PixelRays, view1: PixelRays) -> Bool[Ar
     noise = sum(dot3(x, x) for view in (view0, view1) for x in (view.by_u, view.by_v))
     far = (dot3(normal, normal) < 8.0 * noise) & (dot3(p, q) > 0)
     return far | ((distance0 > 0) & (distance1 > 0))
-
-
-def search_relative_pose(
-    pixels0: Float[Array, "n 2"],
-    pixels1: Float[Array, "n 2"],
-    camera0: Any,
-    camera1: Any,
-    mask: Bool[Array, " n"],
-    quality: Float[ArrayLike, " n"] | None,
-    key: PRNGKeyArray | Array,
-    options: RansacOptions,
-) -> tuple[Float[Array, "3 3"], Consensus]:
-    """Search an essential matrix without the last refinement: the first half of `estimate_relative_pose`.
-
-    It runs in float32; nothing in it is differentiated.
-
-    Returns:
-        The matrix in the dtype of the pixels, zero where nothing was found; and the consensus.
-    """
-    views = single_precision(pair_rays(pixels0, pixels1, camera0, camera1, 1.0))
-    estimator = RelativePoseEstimator(*views, limit=options.threshold_px**2, local_steps=options.local_steps)
-    consensus = search(estimator, mask, single_precision(quality), key, options)
-    return consensus.model.reshape(3, 3).astype(pixels0.dtype), consensus

@@ -39,6 +39,7 @@ class UncertainAlignmentEstimator(eqx.Module):
     covariances0: Float[Array, "n 3 3"]
     covariances1: Float[Array, "n 3 3"]
     limit: float = eqx.field(static=True)
+    model_size: int = eqx.field(static=True, default=12)
     sample_size: int = eqx.field(static=True, default=3)
     chunk_size: int = eqx.field(static=True, default=512)
 

@@ -16,6 +16,7 @@ from vojax.ba import GaussianUniform
 # Observations judged per pass over the models: 1.3 G residuals/s with one, 3.0 with eight, 2.5 with sixteen
 # (jax 0.10.1).
 _UNROLL = 8
+_FEW_MODELS = 32
 
 # squared_error(models, observation) -> [*lanes], elementwise over models [d, *lanes] and one observation's components.
 SquaredError = Callable[[Array, tuple[Array, ...]], Array]
@@ -131,6 +132,12 @@ def msac_scores(
         weights: 1 for observations that count, 0 for padding.
         limit: Squared threshold at which the error is truncated.
     """
-    return sum_losses(
-        lambda error: jnp.minimum(error * (1.0 / limit), 1.0), squared_error, models, observations, weights
-    )
+
+    def loss(error: Array) -> Array:
+        return jnp.minimum(error * (1.0 / limit), 1.0)
+
+    if models.shape[1] <= _FEW_MODELS:
+        # With the observations in the lanes instead: less to compile.
+        errors = squared_error(models[:, :, None], tuple(component[None] for component in observations))
+        return jnp.sum(weights[None] * loss(errors), axis=1)
+    return sum_losses(loss, squared_error, models, observations, weights)
