@@ -7,7 +7,7 @@ recall curve of
 
     absolute     the angle of the rotation, up to 1°
     relative     the larger of the angles of rotation and translation, up to 5°
-    fundamental  the RMS Sampson distance of all true matches without noise, up to 1 px
+    fundamental  the RMS, over all true matches without noise, of the squared Sampson distance, up to 1 px²
     homography   the RMS transfer error of a grid over the image, up to 1 px
 
 OpenCV and COLMAP are given the first 200 of the problems. "One call" is `jax.vmap` of the estimator over 256 problems,

@@ -75,6 +75,31 @@ def _sum_over(axes: tuple[int, ...]) -> Callable[[Array], Array]:
     return total
 
 
+def lane_max(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
+    """Largest entry along an axis that is no lane, for the same reason as `lane_sum`."""
+    return _max_over(axis % x.ndim)(x)
+
+
+@functools.cache
+def _max_over(axis: int) -> Callable[[Array], Array]:
+    @jax.custom_jvp
+    def largest(x: Array) -> Array:
+        info = jnp.finfo(x.dtype)
+
+        def larger(a: Array, b: Array) -> Array:
+            return jax.lax.reduce_precision(jnp.maximum(a, b), info.nexp, info.nmant)
+
+        return jax.lax.reduce(x, np.full((), -np.inf, x.dtype), larger, (axis,))
+
+    @largest.defjvp
+    def _(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        found = largest(primals[0])
+        first = jnp.argmax(primals[0], axis=axis, keepdims=True)
+        return found, jnp.take_along_axis(tangents[0], first, axis=axis).squeeze(axis)
+
+    return largest
+
+
 def dot3(a: Vector3, b: Vector3) -> Array:
     """Scalar product of two vectors given by components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import Vector3, cross3, dot3, lane_sum
+from vojax._numerics import Vector3, cross3, dot3, lane_max, lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import Components, complement, floor, quaternion_from_rotation, squared
@@ -59,13 +59,13 @@ def polish_essential(
     entries = essential_entries(q, t)
     e = entries.reshape(3, 3, 1, *entries.shape[1:])
     images = lane_sum(e * jnp.moveaxis(rays0, 1, 0)[None, :, :, None], axis=1)  # [3, 5, s, *lanes]
-    residual = jnp.max(jnp.abs(lane_sum(images * jnp.moveaxis(rays1, 1, 0)[:, :, None], axis=0)), axis=0)
+    residual = lane_max(jnp.abs(lane_sum(images * jnp.moveaxis(rays1, 1, 0)[:, :, None], axis=0)), axis=0)
     valid = valid & (residual <= 256.0 * eps)
     # Two candidates may come to the same solution: told by two numbers that do not depend on the sign of E.
     first = sum_of_products(_WEIGHTS, list(entries))
     second = sum_of_products(_WEIGHTS, list(entries[::-1]))
     marks = jnp.stack([first * first, first * second])
-    gap = jnp.max(jnp.abs(marks[:, :, None] - marks[:, None]), axis=0)  # [s, s, *lanes]
+    gap = lane_max(jnp.abs(marks[:, :, None] - marks[:, None]), axis=0)  # [s, s, *lanes]
     slots = np.arange(entries.shape[1])
     earlier = jnp.asarray(slots[:, None] > slots[None]).reshape(gap.shape[:2] + (1,) * (gap.ndim - 2))
     valid = valid & ~jnp.any(earlier & valid[None] & (gap < 2.0 * eps**0.5), axis=1)

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import lane_sum
+from vojax._numerics import lane_max, lane_sum
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
@@ -145,7 +145,7 @@ def _matrix(x: Array, w: Array, conics: Array, heights: Array, linear: Array, fa
         [(q + zz[3] * p) / left for p, q in zip(yyz, yzz, strict=True)],
     )
     # One for the whole pencil: the values must stay those of a form.
-    size = 1.0 + jnp.max(sum(jnp.abs(p) for p in (*yy, *zz, *yyz, *yzz)), axis=0)[None]
+    size = 1.0 + lane_max(sum(jnp.abs(p) for p in (*yy, *zz, *yyz, *yzz)), axis=0)[None]
     yyzz = [p + yyz[2] * q + yyz[3] * r for p, q, r in zip((zero, zero, yyz[0], yyz[1]), zz, yzz, strict=True)]
 
     def reduced(q: tuple[Array, ...]) -> list[Array]:
@@ -189,7 +189,7 @@ def _determinant(g: Array) -> Array:
 
 def _null_vector(g: Array) -> Array:
     """The largest vector of cofactors of a row, [4, *lanes]."""
-    size = jnp.max(jnp.abs(g), axis=(0, 1))
+    size = lane_max(lane_max(jnp.abs(g), axis=1), axis=0)
     g = g / jnp.where(size > floor(size), size, 1.0)[None, None]
     best, length = jnp.zeros_like(g[0]), jnp.zeros_like(g[0, 0]) - 1.0
     for row in range(4):
@@ -233,7 +233,7 @@ def _kernel(points: Array, pixels: Array) -> tuple[Array, Array, Array]:
     null = lane_sum(turn.reshape(4, 4, 1, *lanes) * null[None], axis=1)
     basis = null.reshape(4, 2, 4, *problem.usable.shape)
     conics, heights, linear, factors = _forms(basis, problem)
-    largest = jnp.max(jnp.abs(factors), axis=0)
+    largest = lane_max(jnp.abs(factors), axis=0)
     independent = independent & (largest > 256.0 * eps)
     factors = factors / jnp.where(independent, largest, 1.0)[None]
     index = _choice(conics)

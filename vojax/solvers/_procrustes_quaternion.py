@@ -39,8 +39,8 @@ from ._procrustes import centred, correspondences
 from ._weighted_points import Correspondences, centred_components, largest_coordinate, normal_weights
 
 
-def _largest_root(h: Rows3) -> Array:
-    """Largest root of (2), for |H| = 1."""
+def _largest_root(h: Rows3) -> tuple[Array, Array]:
+    """Largest root of (2), for |H| = 1; and 2 |cof H|."""
     cofactors = tuple(
         tuple(
             h[(i + 1) % 3][(j + 1) % 3] * h[(i + 2) % 3][(j + 2) % 3]
@@ -62,7 +62,7 @@ def _largest_root(h: Rows3) -> Array:
         step = (mu * mu - (b * root + c)) / jnp.where(slope > 0, slope, jnp.inf)
         return root - step
 
-    return jax.lax.fori_loop(0, 9 if start.dtype == jnp.float64 else 7, newton, start)
+    return jax.lax.fori_loop(0, 9 if start.dtype == jnp.float64 else 7, newton, start), jnp.sqrt(c)
 
 
 def _null_vector(m: tuple[Components, ...]) -> Components:
@@ -133,15 +133,17 @@ def _kernel(points0: Array, points1: Array, weights: Array) -> tuple[Array, Arra
         (d1, s01, 2.0 * h11 - trace, s12),
         (d2, s02, s12, 2.0 * h22 - trace),
     )
-    root = _largest_root(rows)  # type: ignore[arg-type]
+    root, width = _largest_root(rows)  # type: ignore[arg-type]
     q = _null_vector(tuple(tuple(c - root if i == j else c for j, c in enumerate(row)) for i, row in enumerate(n)))
     gap, regular = jnp.zeros_like(root), jnp.zeros_like(ok)
     q, gap, regular = jax.lax.fori_loop(0, 2, lambda _, state: _newton_step(state[0], n), (q, gap, regular))
     eps = float(jnp.finfo(root.dtype).eps)
-    # Rounding of H is eps |H|, that of the coordinates eps |p| each.
+    # Rounding of H is eps |H|, that of the coordinates eps |p| each. On a line the gap itself is a quotient of rounding
+    # errors: the width, 2 |cof H| and so twice the second singular value, has to exceed them too.
+    margin = (64.0 if eps < 1e-10 else 16.0) * eps
     magnitude = largest_coordinate(points0, ok) * largest_coordinate(points1, ok)
     size = jnp.where(ok, largest, 1.0) * norm
-    ok = ok & regular & (gap > 16.0 * eps + (16.0 * eps) ** 2 * magnitude / size)
+    ok = ok & regular & (jnp.minimum(gap, width) > margin + margin**2 * magnitude / size)
     model = (*q, *difference(mean1, rotate(q, mean0)))
     for component in model:
         ok = ok & jnp.isfinite(component)

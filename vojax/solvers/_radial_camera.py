@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vojax._numerics import cross3, dot3, lane_sum, safe_divide, symmetric_inverse
+from vojax._numerics import cross3, dot3, lane_max, lane_sum, safe_divide, symmetric_inverse
 from vojax._types import Array, ArrayLike, Float
 from vojax.lie import SE3
 
@@ -145,7 +145,7 @@ def cameras_from_rows(p: Array, size: Array, valid: Array, problem: Normalised) 
         left = heights - sum(columns[c] * solution[c][None] for c in range(3))
         rhs = lane_sum(columns * left[None], axis=1)
         solution = [solution[c] + sum(inverse[c, d] * rhs[d] for d in range(3)) for c in range(3)]
-    error = jnp.max(jnp.abs(heights - sum(columns[c] * solution[c][None] for c in range(3))), axis=0)
+    error = lane_max(jnp.abs(heights - sum(columns[c] * solution[c][None] for c in range(3))), axis=0)
     focal, product, depth = (solution[c] / jnp.where(scale[c] > 0, scale[c], 1.0) for c in range(3))
     valid = valid & regular & (focal > floor(focal))
     distortion = product / jnp.where(valid, focal, 1.0)

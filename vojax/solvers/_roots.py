@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vojax._numerics import lane_sum
+from vojax._numerics import lane_max, lane_sum
 from vojax._types import Array, Bool, Float
 
 from ._components import floor, sign
@@ -39,7 +39,7 @@ def quadratic_roots(c: Float[Array, "3 *lanes"]) -> tuple[Float[Array, "2 2 *lan
         Pairs `[2, slots, *lanes]` (u above, v below; x = u / v) and their validity. A double root fills both slots; the
         zero polynomial has no valid slot. Invalid slots hold the pair (0, 1).
     """
-    size = jnp.max(jnp.abs(c), axis=0)
+    size = lane_max(jnp.abs(c), axis=0)
     proper = jnp.isfinite(size) & (size > 0)
     c = jnp.where(proper[None], c / jnp.where(proper, size, 1.0)[None], 0.0)
     half = -0.5 * c[1]
@@ -80,7 +80,7 @@ def polynomial_roots(
     Degenerate input: a double root counts once, twice or, within rounding of being complex, as the place where the
         polynomial comes nearest to zero. The zero polynomial and anything not finite have no root.
     """
-    size = jnp.max(jnp.abs(c), axis=0)
+    size = lane_max(jnp.abs(c), axis=0)
     proper = jnp.isfinite(size) & (size > 0)
     c = jnp.where(proper[None], c / jnp.where(proper, size, 1.0)[None], 0.0)
     c, unit = _balance(c)
@@ -128,8 +128,8 @@ def _balance(c: Array) -> tuple[Array, Array]:
     low, high = low.ravel(), high.ravel()
     crossing = (log[low] - log[high]) / jnp.asarray(high - low, c.dtype).reshape(-1, *lanes)
     height = log[low] + jnp.asarray(low - 0.5 * degree, c.dtype).reshape(-1, *lanes) * crossing
-    top = height >= jnp.max(height, axis=0)[None]
-    exponent = jnp.max(jnp.where(top, crossing, -jnp.inf), axis=0)
+    top = height >= lane_max(height, axis=0)[None]
+    exponent = lane_max(jnp.where(top, crossing, -jnp.inf), axis=0)
     limit = 100 // degree  # coefficients change by 2^50 at most
     exponent = jnp.clip(jnp.round(exponent), -limit, limit)
     powers = jnp.asarray(np.arange(degree + 1) - degree // 2, c.dtype).reshape(-1, *lanes)
@@ -190,7 +190,7 @@ def _solve_intervals(c: Array, edges: Array) -> tuple[Array, Array]:
     at_low, at_high = evaluate(c[:, None], low), evaluate(c[:, None], high)
     rising = at_high > at_low
     # What rounding may have lifted off zero: the ends are critical points, where a double root touches.
-    magnitude = jnp.max(jnp.abs(c), axis=0)[None]
+    magnitude = lane_max(jnp.abs(c), axis=0)[None]
     noise = 2.0 * c.shape[0] * float(jnp.finfo(c.dtype).eps) * magnitude
     crosses = (jnp.minimum(at_low, at_high) <= 0) & (jnp.maximum(at_low, at_high) >= 0) & (at_low != at_high)
     nearest = jnp.where(jnp.abs(at_low) < jnp.abs(at_high), low, high)
