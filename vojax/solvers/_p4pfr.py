@@ -145,7 +145,7 @@ def _matrix(x: Array, w: Array, conics: Array, heights: Array, linear: Array, fa
         [(q + zz[3] * p) / left for p, q in zip(yyz, yzz, strict=True)],
     )
     # One for the whole pencil: the values must stay those of a form.
-    size = 1.0 + lane_max(sum(jnp.abs(p) for p in (*yy, *zz, *yyz, *yzz)), axis=0)[None]
+    size = 1.0 + lane_max(sum(jnp.abs(p) for p in (*yy, *zz, *yyz, *yzz)), axis=0)[None]  # type: ignore[arg-type]
     yyzz = [p + yyz[2] * q + yyz[3] * r for p, q, r in zip((zero, zero, yyz[0], yyz[1]), zz, yzz, strict=True)]
 
     def reduced(q: tuple[Array, ...]) -> list[Array]:
