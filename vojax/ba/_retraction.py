@@ -1,8 +1,8 @@
 """Steps of optimisers on rotations, rigid motions and similarities.
 
 An optimiser and the covariance at its end need steps that agree with exp(−ξ) @ model to first order, no more. These do,
-for a fraction of the code of an exponential that is exact for steps of any size, which was a third of what a robust
-estimate compiled. A step of the size φ turns by 2 atan(|φ|/2): a wild one by less than half a turn.
+for a fraction of the code of an exponential that is exact for steps of any size, which was nearly a third of the
+operations of a local optimisation. A step of the size φ turns by 2 atan(|φ|/2): a wild one by less than half a turn.
 """
 
 import jax.numpy as jnp
