@@ -15,6 +15,7 @@ from vojax.ba import Cauchy, LMOptions, polish_absolute_pose, refine_absolute_po
 from vojax.lie import SE3, SO3
 from vojax.solvers import p3p
 
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
@@ -128,7 +129,7 @@ def estimate_absolute_pose(
         50
     """
     points_world, pixels = checked_observations(points_world, pixels)
-    return _estimate(points_world, pixels, camera, key, options, sigma_px, quality, mask)
+    return in_bucket(_estimate, (points_world, pixels), (camera, key, options), sigma_px, quality, mask)
 
 
 @eqx.filter_jit

@@ -23,6 +23,7 @@ from vojax.ba import (
 from vojax.lie import SE3, SO3, Sim3
 from vojax.solvers import rigid_three_point, umeyama
 
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
@@ -133,7 +134,7 @@ def estimate_rigid(
     References: see the module.
     """
     first, second = checked_pairs(points0, points1, 3, "a rigid motion", d=3)
-    return _estimate(first, second, False, key, options, sigma, quality, mask)
+    return in_bucket(_estimate, (first, second), (False, key, options), sigma, quality, mask)
 
 
 def estimate_similarity(
@@ -165,7 +166,7 @@ def estimate_similarity(
     References: see the module.
     """
     first, second = checked_pairs(points0, points1, 3, "a similarity", d=3)
-    return _estimate(first, second, True, key, options, sigma, quality, mask)
+    return in_bucket(_estimate, (first, second), (True, key, options), sigma, quality, mask)
 
 
 @eqx.filter_jit

@@ -29,6 +29,7 @@ from vojax.ba import (
 from vojax.lie import SO3
 from vojax.solvers import rotation_from_rays, unit_matrix
 
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
@@ -173,7 +174,7 @@ def estimate_rotation(
     References: see the module.
     """
     first, second = checked_pairs(pixels0, pixels1, 2, "a rotation")
-    return _estimate(True, first, second, camera0, camera1, key, options, sigma_px, quality, mask)
+    return in_bucket(_estimate, (first, second), (True, camera0, camera1, key, options), sigma_px, quality, mask)
 
 
 def estimate_calibrated_homography(
@@ -193,14 +194,14 @@ def estimate_calibrated_homography(
     `covariance` is that of the coordinates of a change of H in `vojax.ba.homography_basis(H)`.
     """
     first, second = checked_pairs(pixels0, pixels1, 4, "a homography")
-    return _estimate(False, first, second, camera0, camera1, key, options, sigma_px, quality, mask)
+    return in_bucket(_estimate, (first, second), (False, camera0, camera1, key, options), sigma_px, quality, mask)
 
 
 @eqx.filter_jit
 def _estimate(
-    rotates: bool,
     pixels0: Array,
     pixels1: Array,
+    rotates: bool,
     camera0: Any,
     camera1: Any,
     key: Any,

@@ -27,6 +27,7 @@ from vojax.lie import SE3, SO3
 from vojax.solvers import gp3p
 
 from ._alignment import motion_of_entries
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
@@ -125,8 +126,8 @@ def estimate_generalized_pose(
         ValueError: If shapes do not fit or there are fewer than three correspondences.
     References: see the module.
     """
-    points_world, pixels, camera_index = checked_rig_observations(points_world, pixels, camera_index)
-    return _estimate(points_world, pixels, camera_index, rig, key, options, sigma_px, quality, mask)
+    observations = checked_rig_observations(points_world, pixels, camera_index)
+    return in_bucket(_estimate, observations, (rig, key, options), sigma_px, quality, mask)
 
 
 def checked_rig_observations(

@@ -30,6 +30,7 @@ from vojax.ba import (
 )
 from vojax.solvers import homography_four_point, seven_point, unit_matrix
 
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
@@ -160,7 +161,7 @@ def estimate_fundamental(
     References: see the module.
     """
     first, second = checked_pairs(pixels0, pixels1, 7, "a fundamental matrix")
-    return _fundamental(first, second, key, options, sigma_px, quality, mask)
+    return in_bucket(_fundamental, (first, second), (key, options), sigma_px, quality, mask)
 
 
 def estimate_homography(
@@ -200,7 +201,7 @@ def estimate_homography(
     References: see the module.
     """
     first, second = checked_pairs(pixels0, pixels1, 4, "a homography")
-    return _homography(first, second, key, options, sigma_px, quality, mask)
+    return in_bucket(_homography, (first, second), (key, options), sigma_px, quality, mask)
 
 
 @eqx.filter_jit

@@ -27,6 +27,7 @@ from vojax.lie import SE3
 from vojax.solvers import five_point
 from vojax.solvers._essential_newton import motion_from_essential
 
+from ._buckets import in_bucket
 from ._conclude import conclude
 from ._engine import search
 from ._estimate import Estimate
@@ -125,7 +126,7 @@ def estimate_relative_pose(
     References: see the module.
     """
     first, second = checked_pairs(pixels0, pixels1, 5, "a relative pose")
-    return _estimate(first, second, camera0, camera1, key, options, sigma_px, quality, mask)
+    return in_bucket(_estimate, (first, second), (camera0, camera1, key, options), sigma_px, quality, mask)
 
 
 @eqx.filter_jit
