@@ -58,6 +58,33 @@ def test_one_estimator_is_measured(tmp_path, capsys):
         assert row["success"] == 1.0
 
 
+def test_one_adjustment_is_measured(tmp_path, capsys):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "ba", "--batch", "2", "--only", "poses", "--json", str(file)]) == 0
+    assert "poses of 100 points" in capsys.readouterr().out
+    (row,) = json.loads(file.read_text())["rows"]
+    assert (row["batch"], row["observations"]) == (2, 100)
+    assert row["milliseconds"] > 0
+    assert row["iterations"] > 1
+
+
+@pytest.mark.slow
+def test_every_adjustment_is_measured(capsys):
+    assert main(["bench", "ba", "--batch", "4"]) == 0
+    printed = capsys.readouterr().out
+    assert all(word in printed for word in ("windows of 6", "stereo window of 10", "bundle of 50", "float64"))
+
+
+@pytest.mark.slow
+def test_one_pipeline_is_measured(tmp_path, capsys):
+    file = tmp_path / "bench.json"
+    assert main(["bench", "vo", "--batch", "20", "--only", "stereo-3d2d", "--json", str(file)]) == 0
+    (row,) = json.loads(file.read_text())["rows"]
+    assert (row["name"], row["frames"], row["bridged"]) == ("stereo-3d2d", 20, 0)
+    assert row["frames_per_second"] > 0
+    assert row["drift_percent"] < 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(estimators()))
 def test_problems_of_the_table_can_be_solved(name):
@@ -72,6 +99,8 @@ def test_problems_of_the_table_can_be_solved(name):
         (["solvers", "--batch", "0"], "batch is 0"),
         (["solvers", "--only", "no_such_solver"], "no_such_solver"),
         (["robust", "--only", "no_such_estimator"], "no_such_estimator"),
+        (["ba", "--only", "no_such_problem"], "no_such_problem"),
+        (["vo", "--only", "no_such_pipeline"], "no_such_pipeline"),
         (["everything"], "expected one of 'solvers'"),
     ],
 )

@@ -141,10 +141,11 @@ class Calibrate:
 class Bench:
     """Measure the speed of vojax on this machine: run it while nothing else computes."""
 
-    what: Annotated[Literal["solvers", "robust"], tyro.conf.Positional]
+    what: Annotated[Literal["solvers", "robust", "ba", "vo"], tyro.conf.Positional]
     """What is measured."""
     batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Problems solved in one call; 100,000 for solvers and 64 for robust estimators where left out."""
+    """Problems solved in one call, 100,000 for solvers, 64 for robust estimators and 256 for ba where left out; frames
+    of vo, 60."""
     only: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """Only those with this in their names."""
     json: Annotated[pathlib.Path | None, tyro.conf.arg(metavar="FILE")] = None

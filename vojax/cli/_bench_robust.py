@@ -4,6 +4,7 @@ Problems have 1 px of noise (0.01 of rigid scenes), images of 1280 × 960 with a
 observations uniform over the image or the scene. `benchmarks/bench_robust.py` has the accuracy, beside other libraries.
 """
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from vojax.cameras import Pinhole, Rig
 from vojax.datasets import simulate_absolute_pose, simulate_relative_pose, simulate_rigid
 from vojax.lie import SE3
 
+BATCH = 64
+COLUMNS = ("estimator", "outliers", "ms, one problem", "ms each, in a batch", "success", "compile s")
 SHARES = (0.3, 0.5, 0.7)
 _POINTS = 200
 _REPEATS = 20
@@ -41,6 +44,11 @@ class Row(NamedTuple):
     batched: float
     success: float
     compile_seconds: float
+
+    def cells(self) -> tuple[str, ...]:
+        """What the table shows."""
+        times = f"{self.milliseconds:.2f}", f"{self.batched:.2f}"
+        return self.name, f"{self.outliers:.0%}", *times, f"{self.success:.0%}", f"{self.compile_seconds:.1f}"
 
 
 def _absolute(key: Any, n: int, share: float) -> tuple[Any, ...]:
@@ -101,6 +109,15 @@ def estimators() -> dict[str, Estimator]:
         "homography": Estimator(lambda u, v, key: robust.estimate_homography(u, v, key=key), _plane),
         "rigid": Estimator(lambda x, y, key: robust.estimate_rigid(x, y, key=key), _points),
         "similarity": Estimator(lambda x, y, key: robust.estimate_similarity(x, y, key=key), _points),
+    }
+
+
+def tasks(batch: int) -> dict[str, Callable[[], Row]]:
+    """Each measures one row."""
+    return {
+        f"{name}, {share:.0%}": functools.partial(measure, name, estimator, share, batch)
+        for name, estimator in estimators().items()
+        for share in SHARES
     }
 
 

@@ -15,6 +15,17 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from vojax import solvers
 
+BATCH = 100_000
+COLUMNS = (
+    "solver",
+    "dtype",
+    "ns per solve",
+    "split over devices",
+    "fastest",
+    "compile s",
+    "PoseLib C++, published",
+)
+
 
 class Problem(NamedTuple):
     """A solver, what it is called on, and what its peer needs.
@@ -50,6 +61,22 @@ class Row(NamedTuple):
     best: float
     compile_seconds: float
     poselib_ns: float | None
+
+    def cells(self) -> tuple[str, ...]:
+        """What the table shows."""
+        peer = "" if self.poselib_ns is None else f"{self.poselib_ns:.0f}"
+        sharded = "" if self.sharded is None else f"{self.sharded:.0f}"
+        times = f"{self.nanoseconds:.0f}", sharded, f"{self.best:.0f}", f"{self.compile_seconds:.1f}"
+        return self.name, self.dtype, *times, peer
+
+
+def tasks(batch: int) -> dict[str, Callable[[], Row]]:
+    """Each measures one row."""
+    return {
+        f"{name}, {dtype}": functools.partial(measure, name, problem, dtype)
+        for name, problem in problems(batch).items()
+        for dtype in ("float32", "float64")
+    }
 
 
 def problems(batch: int, seed: int = 0) -> dict[str, Problem]:
