@@ -54,7 +54,7 @@ class Reduced(eqx.Module):
 
     factor: Float[Array, "u u"]
     scale: Float[Array, " u"]
-    eliminated: Float[Array, "u q"]
+    eliminated: tuple[Array, ...]  # E [u, p] for each coordinate of the landmarks
     landmark_root: tuple[Array, ...]  # L⁻¹ of the landmark blocks, row by row
     regular: Bool[Array, ""]
 
@@ -72,20 +72,19 @@ def reduce(system: ArrowSystem) -> Reduced:
     """
     c, p = system.camera.shape[-1], system.landmark.shape[-1]
     root = _inverse_root(system.landmark)
-    spread = tuple(jnp.broadcast_to(entry[None, None], (6, c, p)) for entry in root)
-    eliminated = _times_root(spread, jnp.moveaxis(system.cross, 2, 0))
-    eliminated = jnp.moveaxis(eliminated, 0, 2).reshape(6 * c, 3 * p)
+    # Not one matrix [u, 3 p]: putting it together takes XLA longer than the product.
+    eliminated = _times_root(root, tuple(system.cross[:, :, i].reshape(6 * c, p) for i in range(3)))
     full = _spread(system.camera).reshape(6 * c, 6 * c)
     if system.coupling is not None:
         full = full + system.coupling.reshape(6 * c, 6 * c)
-    full = full - jnp.matmul(eliminated, eliminated.T, precision="highest")
+    full = full - sum(jnp.matmul(e, e.T, precision="highest") for e in eliminated)
     # Jacobi scaling makes metres and radians comparable, which float32 needs.
     diagonal = system.camera_diagonal().reshape(-1)
     informed = diagonal > 0
     scale = jnp.where(informed, jax.lax.rsqrt(jnp.where(informed, diagonal, 1.0)), 0.0)
     scaled = scale[:, None] * full * scale[None, :] + jnp.diag(jnp.where(informed, 0.0, 1.0).astype(full.dtype))
     factor = jnp.linalg.cholesky(scaled, symmetrize_input=False)
-    regular = jnp.all(jnp.isfinite(factor))
+    regular = jnp.isfinite(factor[-1, -1])  # all of it is NaN where the factorisation failed
     factor = jnp.where(regular, factor, jnp.eye(6 * c, dtype=full.dtype))
     return Reduced(factor, scale, eliminated, root, regular)
 
@@ -96,18 +95,19 @@ def solve(system: ArrowSystem) -> tuple[Float[Array, "6 c"], Float[Array, "3 p"]
     Where the reduced system cannot be factored, the cameras' answer is the diagonally scaled gradient step, which is
     finite.
     """
-    c, p = system.camera.shape[-1], system.landmark.shape[-1]
+    c = system.camera.shape[-1]
     reduced = reduce(system)
-    halved = _times_root(reduced.landmark_root, system.landmark_gradient).reshape(3 * p)
-    rhs = jnp.matmul(reduced.eliminated, halved, precision="highest") - system.camera_gradient.reshape(6 * c)
+    halved = _times_root(reduced.landmark_root, tuple(system.landmark_gradient))
+    rhs = sum(jnp.matmul(e, h, precision="highest") for e, h in zip(reduced.eliminated, halved, strict=True))
+    rhs = rhs - system.camera_gradient.reshape(6 * c)
     cameras = reduced.solve_cameras(rhs[:, None])[:, 0]
     diagonal = system.camera_diagonal()
     informed = diagonal > 0
     fallback = jnp.where(informed, -system.camera_gradient / jnp.where(informed, diagonal, 1.0), 0.0)
     cameras = jnp.where(reduced.regular, cameras, fallback.reshape(6 * c))
     # V η = −g − Wᵀ ξ is Lᵀ η = −(L⁻¹ g + Eᵀ ξ).
-    halved = halved + jnp.matmul(cameras, reduced.eliminated, precision="highest")
-    return cameras.reshape(6, c), -_times_root_transposed(reduced.landmark_root, halved.reshape(3, p))
+    halved = [h + jnp.matmul(cameras, e, precision="highest") for h, e in zip(halved, reduced.eliminated, strict=True)]
+    return cameras.reshape(6, c), -_times_root_transposed(reduced.landmark_root, halved)
 
 
 def camera_covariances(system: ArrowSystem) -> tuple[Float[Array, "c 6 6"], Bool[Array, ""]]:
@@ -197,13 +197,14 @@ def _inverse_root(matrix: Float[Array, "3 3 *lanes"]) -> tuple[Array, ...]:
     return a, low, b, -c * (columns[0][2] * a + columns[1][1] * low), -c * columns[1][1] * b, c
 
 
-def _times_root(root: tuple[Array, ...], x: Float[Array, "3 *lanes"]) -> Float[Array, "3 *lanes"]:
-    return jnp.stack(
-        [root[0] * x[0], root[1] * x[0] + root[2] * x[1], root[3] * x[0] + root[4] * x[1] + root[5] * x[2]]
-    )
+def _times_root(root: tuple[Array, ...], x: tuple[Array, ...]) -> tuple[Array, ...]:
+    """L⁻¹ x for landmarks in the lanes; x may have an axis before them."""
+    if x[0].ndim == 2:
+        root = tuple(entry[None] for entry in root)
+    return root[0] * x[0], root[1] * x[0] + root[2] * x[1], root[3] * x[0] + root[4] * x[1] + root[5] * x[2]
 
 
-def _times_root_transposed(root: tuple[Array, ...], x: Float[Array, "3 p"]) -> Float[Array, "3 p"]:
+def _times_root_transposed(root: tuple[Array, ...], x: list[Array]) -> Float[Array, "3 p"]:
     return jnp.stack(
         [root[0] * x[0] + root[1] * x[1] + root[3] * x[2], root[2] * x[1] + root[4] * x[2], root[5] * x[2]]
     )

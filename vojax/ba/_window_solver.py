@@ -1,4 +1,4 @@
-"""Levenberg–Marquardt on the manifold of a window, in optimistix' loop; batches of windows in pieces."""
+"""Levenberg–Marquardt on the manifold of a window, in optimistix' loop; batches of windows through a few lanes."""
 
 import functools
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from ._losses import Loss
 from ._window_residual import Blocks, WindowData, WindowState, cost, linearize, residuals
 from ._window_schur import SchurDescent
 
-# Windows solved side by side: their normal equations stay in the cache, and few wait for the slowest.
-_CHUNK = 16
+# Windows solved side by side: their normal equations stay in the cache.
+_LANES = 16
 
 
 class Optimum(NamedTuple):
@@ -96,6 +96,11 @@ class WindowLevenbergMarquardt(UntilConverged):
         search_state = self.search.init(step, None)  # type: ignore[arg-type]
         return _State(jnp.array(True), step, y, blocks, search_state, jnp.zeros((), dtype))
 
+    def restarted(self, state: _State, y: WindowState) -> _State:
+        """Ready for the first step of another window; what that step does not read stays as it is."""
+        search_state = self.search.init(state.step, None)  # type: ignore[arg-type]
+        return _State(jnp.array(True), state.step, y, state.blocks, search_state, state.initial_cost)
+
     def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: frozenset[object]) -> Any:
         """Judge the trial point and take the next step from the better one."""
         del fn, options, tags
@@ -122,54 +127,89 @@ class WindowLevenbergMarquardt(UntilConverged):
 
 
 def optimise(start: WindowState, data: WindowData, loss: Loss, options: LMOptions) -> Optimum:
-    """Solve one window; a batch under `vmap` goes through in pieces. Not differentiable."""
+    """Solve one window; a batch under `vmap` goes through a few lanes. Not differentiable."""
     return _batchable(options)(start, data, loss)
 
 
 @functools.cache
 def _batchable(options: LMOptions) -> Callable[..., Optimum]:
     """The solver with a rule of its own for batches."""
+    solver = WindowLevenbergMarquardt(SchurDescent(), options)
 
     def plain(start: WindowState, data: WindowData, loss: Loss) -> Optimum:
         solution = optx.least_squares(
-            lambda y, args: residuals(y, *args),
-            WindowLevenbergMarquardt(SchurDescent(), options),
-            start,
-            (data, loss),
-            max_steps=options.max_steps,
-            throw=False,
+            lambda y, args: residuals(y, *args), solver, start, (data, loss), max_steps=options.max_steps, throw=False
         )
-        y = WindowState(solution.value.poses.normalize(), solution.value.points)
         successful = solution.result == optx.RESULTS.successful
-        return Optimum(y, solution.state.initial_cost, solution.stats["num_steps"], successful)
+        return _optimum(solution.value, solution.state, solution.stats["num_steps"], successful)
 
     one = custom_vmap(plain)
 
     @one.def_vmap
     def _(axis_size: int, batched: Any, *arguments: Any) -> Any:
         axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
-        many = jax.vmap(plain, in_axes=tuple(axes))
-        count = -(-axis_size // _CHUNK)
-        if count == 1:
-            return (found := many(*arguments)), jax.tree.map(lambda _: True, found)
-        size = -(-axis_size // count)
-        flat, tree = jax.tree.flatten(arguments)
-        mapped = jax.tree.leaves(batched)
-
-        def pieces(leaf: Array) -> Array:
-            # Filled up with copies of the last window, which ends when that one does.
-            padding = ((0, count * size - axis_size), *((0, 0),) * (leaf.ndim - 1))
-            return jnp.pad(leaf, padding, mode="edge").reshape(count, size, *leaf.shape[1:])
-
-        chunks = [pieces(leaf) for leaf, is_mapped in zip(flat, mapped, strict=True) if is_mapped]
-
-        def solve(chunk: list[Array]) -> Optimum:
-            rest = iter(chunk)
-            leaves = [next(rest) if is_mapped else leaf for leaf, is_mapped in zip(flat, mapped, strict=True)]
-            return many(*jax.tree.unflatten(tree, leaves))
-
-        found = jax.lax.map(solve, chunks)
-        found = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:axis_size], found)
+        if axis_size <= _LANES:
+            found = jax.vmap(plain, in_axes=tuple(axes))(*arguments)
+        else:
+            found = _in_lanes(solver, options.max_steps, axis_size, batched, arguments)
         return found, jax.tree.map(lambda _: True, found)
 
     return one
+
+
+def _optimum(y: WindowState, state: _State, steps: Array, converged: Array) -> Optimum:
+    return Optimum(WindowState(y.poses.normalize(), y.points), state.initial_cost, steps, converged)
+
+
+class _Lanes(NamedTuple):
+    """Windows under way, one in each lane, and those that are done."""
+
+    window: Int[Array, " lanes"]  # its number; the number of windows or more where there is none left
+    following: Int[Array, ""]
+    y: WindowState
+    state: _State
+    steps: Int[Array, " lanes"]
+    found: Optimum
+
+
+def _in_lanes(
+    solver: WindowLevenbergMarquardt, max_steps: int, count: int, batched: Any, arguments: tuple[Any, ...]
+) -> Optimum:
+    """Solve many windows, a few at a time: a lane whose window is done takes the next; none waits for the slowest."""
+
+    def taken(window: Array) -> Any:
+        rows = jnp.minimum(window, count - 1)
+        return jax.tree.map(lambda x, is_batched: x[rows] if is_batched else x, arguments, tuple(batched))
+
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+
+    def begin(start: WindowState, data: WindowData, loss: Loss) -> tuple[WindowState, _State]:
+        return start, solver.init(None, start, (data, loss), {}, None, None, frozenset())
+
+    def step(y: WindowState, state: _State, start: WindowState, data: WindowData, loss: Loss) -> Any:
+        del start
+        y, state, _ = solver.step(None, y, (data, loss), {}, state, frozenset())
+        return y, state
+
+    def body(lanes: _Lanes) -> _Lanes:
+        y, state = jax.vmap(step, in_axes=(0, 0, *axes))(lanes.y, lanes.state, *taken(lanes.window))
+        steps = lanes.steps + 1
+        converged = state.search_state.converged
+        ended = converged | (steps >= max_steps)
+        rows = jnp.where(ended, lanes.window, count)  # others are dropped
+        optimum = jax.vmap(_optimum)(y, state, steps, converged)
+        found = jax.tree.map(lambda out, x: out.at[rows].set(x, mode="drop"), lanes.found, optimum)
+        window = jnp.where(ended, lanes.following + jnp.cumsum(ended) - 1, lanes.window)
+        start = taken(window)[0]
+        renewed = (start, jax.vmap(solver.restarted)(state, start))
+        choose = lambda new, old: jnp.where(ended.reshape(-1, *(1,) * (new.ndim - 1)), new, old)  # noqa: E731
+        y, state = jax.tree.map(choose, renewed, (y, state))
+        return _Lanes(window, lanes.following + jnp.sum(ended), y, state, jnp.where(ended, 0, steps), found)
+
+    window = jnp.arange(_LANES)
+    y, state = jax.vmap(begin, in_axes=axes)(*taken(window))
+    steps = jnp.zeros((_LANES,), jnp.int32)
+    found = jax.eval_shape(jax.vmap(_optimum), y, state, steps, state.search_state.converged)
+    found = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), found)
+    first = _Lanes(window, jnp.asarray(_LANES), y, state, steps, found)
+    return jax.lax.while_loop(lambda lanes: jnp.any(lanes.window < count), body, first).found
