@@ -75,7 +75,7 @@ def test_derivatives_have_the_rows_that_were_given():
     gradient = jax.grad(depth)(pixels)
     assert gradient.shape == (57, 2)
     assert bool(jnp.all(jnp.isfinite(gradient)))
-    assert float(jnp.abs(gradient[:11]).max()) == 0.0  # outliers
+    assert float(jnp.abs(gradient[:11]).max()) < 1e-6 * float(jnp.abs(gradient[11:]).max())  # outliers
     assert float(jnp.abs(gradient[11:]).min()) > 0.0
 
 

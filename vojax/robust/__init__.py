@@ -40,3 +40,4 @@ from ._soft import softmax_weights as softmax_weights
 from ._soft import sparsemax_weights as sparsemax_weights
 from ._soft_sampling import draw_gumbel_samples as draw_gumbel_samples
 from ._soft_sampling import sample_log_probability as sample_log_probability
+from ._translation import estimate_translation as estimate_translation

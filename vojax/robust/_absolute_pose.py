@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
-from vojax.ba import Cauchy, LMOptions, polish_absolute_pose, refine_absolute_pose
+from vojax.ba import Cauchy, GaussianUniform, LMOptions, polish_absolute_pose, refine_absolute_pose
 from vojax.lie import SE3, SO3
 from vojax.solvers import p3p
 
@@ -20,8 +20,8 @@ from ._conclude import conclude
 from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
-from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes, usable_noise
-from ._significance import chance_in_image
+from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes, root_mean_square, usable_noise
+from ._significance import SQRT_TAU, chance_in_image, even_odds
 
 
 class AbsolutePoseEstimator(eqx.Module):
@@ -149,13 +149,25 @@ def _estimate(
     start, consensus = search_absolute_pose(centered, pixels, camera, mask, quality, key, options)
 
     dtype = points_world.dtype
+    # All observations in front take part, weighted by how likely they are inliers: what the threshold cuts off would be
+    # missing from the covariance.
+    sigma = root_mean_square(sigma_px, mask).astype(dtype)
+    chance = chance_in_image(pixels, mask, options.threshold_px)
+    cut = even_odds(
+        jnp.sum(consensus.inliers),
+        jnp.sum(mask),
+        1.0 / (SQRT_TAU * sigma) ** 2,
+        chance / (jnp.pi * options.threshold_px**2),
+    )
+    front = jax.lax.stop_gradient(start.apply(centered)[:, 2] > 0)
     refined = refine_absolute_pose(
         start,
         centered,
         pixels,
         camera,
         sigma_px=sigma_px,
-        mask=consensus.inliers,
+        mask=mask & front,
+        loss=GaussianUniform(cut),
         options=LMOptions(max_steps=options.final_steps),
     )
     points_cam = refined.model.apply(centered)
@@ -170,7 +182,7 @@ def _estimate(
         consensus=consensus,
         mask=mask,
         sample_size=3,
-        chance=chance_in_image(pixels, mask, options.threshold_px),
+        chance=chance,
         limit=options.threshold_px**2,
     )
 

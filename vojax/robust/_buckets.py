@@ -40,7 +40,7 @@ def in_bucket(
         estimate: Compiled by size.
         observations: What has a row for each correspondence.
         others: What has not.
-        sigma: Noise; arrays have a row for each correspondence.
+        sigma: Noise, or None; arrays have a row for each correspondence.
         quality: Of each correspondence, or None.
         mask: Rows that count, or None.
 
@@ -51,7 +51,8 @@ def in_bucket(
         ValueError: If noise, quality or mask do not fit the observations.
     """
     n = observations[0].shape[0]
-    check_sigma(sigma, n)
+    if sigma is not None:
+        check_sigma(sigma, n)
     for name, rows in (("quality", quality), ("mask", mask)):
         if rows is not None and jnp.shape(rows) != (n,):
             raise ValueError(f"{name} has shape {jnp.shape(rows)}: expected one entry for each of {n} rows, ({n},)")
@@ -60,7 +61,7 @@ def in_bucket(
     size = bucket_size(n)
     if size == n:
         return estimate(*observations, *others, sigma, quality, mask)
-    noise = sigma if jnp.ndim(sigma) else None
+    noise = None if sigma is None or not jnp.ndim(sigma) else sigma
     observations, filled_noise, quality, mask = _filled((observations, noise, quality, mask), size)
     found = estimate(*observations, *others, sigma if noise is None else filled_noise, quality, mask)
     return dataclasses.replace(found, inliers=_first(found.inliers, n))

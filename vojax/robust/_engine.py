@@ -17,7 +17,14 @@ from jax.custom_batching import custom_vmap
 from vojax._types import Array, Bool, Float, Int
 
 from ._options import RansacOptions
-from ._sampling import draw_samples, guided_pool, random_uniform, required_hypotheses, sampling_order
+from ._sampling import (
+    draw_samples,
+    guided_pool,
+    random_uniform,
+    required_guided_hypotheses,
+    required_hypotheses,
+    sampling_order,
+)
 from ._scoring import msac_scores
 
 # Local optimisation is for chunks whose best sample explains this share of what the best sample so far explains. With
@@ -164,8 +171,13 @@ def _search(
         models = jnp.concatenate([state.model[:, None], survivors[:, top[:1]], polished], axis=1)
         scores = jnp.concatenate([state.score[None], scores[top[:1]], polished_scores])
         best = jnp.argmin(scores)
-        ratio = jnp.sum(_inliers(estimator, models[:, best], mask)) / jnp.maximum(count, 1)
+        inliers = _inliers(estimator, models[:, best], mask)
+        ratio = jnp.sum(inliers) / jnp.maximum(count, 1)
         required = required_hypotheses(ratio.astype(dtype), m, options.confidence)
+        if quality is not None:
+            last = (state.chunk + 1) * k - 1
+            guided = required_guided_hypotheses(inliers, order, last, count, m, options.confidence)
+            required = jnp.minimum(required, guided.astype(dtype))
         required = jnp.where(jnp.isfinite(scores[best]), required, jnp.inf)
         return _State(state.chunk + 1, models[:, best], scores[best], sampled, required)
 
