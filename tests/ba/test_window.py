@@ -394,3 +394,29 @@ def test_shapes_that_do_not_fit_are_said_in_one_line():
     with pytest.raises(ValueError, match="window shapes do not fit") as caught:
         adjust_window(poses, np.zeros((5, 3), np.float32), measurements, mask, camera)
     assert "\n" not in str(caught.value)
+
+
+def test_more_windows_than_lanes_end_as_they_do_a_few_at_a_time():
+    parts = [simulate(seed, spread=spread)[0] for seed, spread in ((31, 0.0), (32, 0.3), (33, 0.05))]
+    together = adjust(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts), Squared())
+    apart = [adjust(part, Squared()) for part in parts]
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *apart)
+    assert np.ptp(joined.iterations) >= 2  # lanes are taken over at different times
+    assert np.max(np.abs(together.iterations - joined.iterations)) <= 1  # rounding differs between the two programs
+    np.testing.assert_array_equal(together.result == Result.success, joined.result == Result.success)
+    np.testing.assert_allclose(together.cost, joined.cost, rtol=1e-5)
+    np.testing.assert_allclose(together.world_from_cam.wxyz_xyz, joined.world_from_cam.wxyz_xyz, atol=2e-5)
+
+
+def test_many_windows_may_start_from_the_same_poses():
+    window, _ = simulate(34)
+    stereo = RectifiedStereo(Pinhole(fx=FOCAL, fy=FOCAL, cx=CENTER[0], cy=CENTER[1]), BASELINE)
+    poses, points = jax.tree.map(lambda leaf: leaf[0], (window["poses"], window["points"]))
+    measured = window["measurements"][0][None] + jnp.arange(20.0)[:, None, None, None] * 0.01
+
+    def cost(poses, measurements):
+        return adjust_window(poses, points, measurements, window["mask"][0], stereo).cost
+
+    shared = jax.vmap(cost, in_axes=(None, 0))(poses, measured)
+    alone = jax.vmap(cost)(jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, *leaf.shape)), poses), measured)
+    np.testing.assert_allclose(shared, alone, rtol=1e-6)

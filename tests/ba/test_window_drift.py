@@ -1,4 +1,4 @@
-"""The study of row 98 in its small mode: drives of 100 m."""
+"""The study of drift with and without a window in its small mode: drives of 100 m."""
 
 import importlib.util
 import pathlib

@@ -176,12 +176,16 @@ def _in_lanes(
     solver: WindowLevenbergMarquardt, max_steps: int, count: int, batched: Any, arguments: tuple[Any, ...]
 ) -> Optimum:
     """Solve many windows, a few at a time: a lane whose window is done takes the next; none waits for the slowest."""
+    # Each lane has its own state, also where all windows start alike.
+    every = lambda x, is_batched: x if is_batched else jnp.broadcast_to(x, (count, *x.shape))  # noqa: E731
+    arguments = (jax.tree.map(every, arguments[0], batched[0]), *arguments[1:])
+    batched = (jax.tree.map(lambda _: True, batched[0]), *batched[1:])
 
     def taken(window: Array) -> Any:
         rows = jnp.minimum(window, count - 1)
-        return jax.tree.map(lambda x, is_batched: x[rows] if is_batched else x, arguments, tuple(batched))
+        return jax.tree.map(lambda x, is_batched: x[rows] if is_batched else x, arguments, batched)
 
-    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
 
     def begin(start: WindowState, data: WindowData, loss: Loss) -> tuple[WindowState, _State]:
         return start, solver.init(None, start, (data, loss), {}, None, None, frozenset())

@@ -13,6 +13,8 @@ from ._dlt_pnp import dlt_pnp_calibrated as dlt_pnp_calibrated
 from ._eight_point import eight_point as eight_point
 from ._epnp import epnp as epnp
 from ._essential_projection import project_to_essential as project_to_essential
+from ._factorization import AffineScene as AffineScene
+from ._factorization import affine_factorization as affine_factorization
 from ._five_point import five_point as five_point
 from ._five_point_action_matrix import five_point_action_matrix as five_point_action_matrix
 from ._focal_from_fundamental import focal_from_fundamental as focal_from_fundamental
@@ -31,6 +33,9 @@ from ._icp import icp as icp
 from ._implicit import implicit as implicit
 from ._implicit import perturb_camera as perturb_camera
 from ._matrix_models import unit_matrix as unit_matrix
+from ._metric_upgrade import MetricScene as MetricScene
+from ._metric_upgrade import metric_factorization as metric_factorization
+from ._metric_upgrade import metric_upgrade as metric_upgrade
 from ._one_point import ScaleFromTurn as ScaleFromTurn
 from ._one_point import arc_motion as arc_motion
 from ._one_point import one_point as one_point
@@ -44,6 +49,8 @@ from ._p4pf import FocalCamera as FocalCamera
 from ._p4pf import p4pf as p4pf
 from ._p4pfr import p4pfr as p4pfr
 from ._p5pfr import p5pfr as p5pfr
+from ._perspective_factorization import PerspectiveScene as PerspectiveScene
+from ._perspective_factorization import perspective_factorization as perspective_factorization
 from ._planar_two_point import planar_two_point as planar_two_point
 from ._plane_motions import align_2d_covariance as align_2d_covariance
 from ._point_line import p1p2l as p1p2l
