@@ -132,6 +132,21 @@ def test_gradients_are_those_of_the_refined_position():
             np.testing.assert_allclose(float(jnp.sum(gradient * direction)), expected, rtol=1e-5, atol=1e-8)
 
 
+def test_gradients_do_not_see_what_is_masked():
+    camera = Pinhole(**CAMERA)
+    problem = simulate_absolute_pose(jax.random.key(6), 24, sigma_px=0.5)
+    points, pixels = problem.points_world.at[0].set(jnp.nan), problem.pixels.at[1].set(jnp.inf)
+
+    def length(points, pixels, wxyz):
+        found = estimate_translation(points, pixels, camera, SO3(wxyz), key=jax.random.key(0))
+        return jnp.sum(found.model.translation() ** 2)
+
+    gradients = jax.jit(jax.grad(length, argnums=(0, 1, 2)))(points, pixels, problem.cam_from_world.rotation().wxyz)
+    assert all(np.isfinite(gradient).all() for gradient in gradients)
+    assert np.all(np.asarray(gradients[0][:2]) == 0)
+    assert np.any(np.asarray(gradients[0][2:]) != 0)
+
+
 def test_bad_input_has_a_code_and_nothing_that_is_not_a_number():
     problem = simulate(1, 0.0)
     points, pixels, mask = np.array(problem.points_world), np.array(problem.pixels), np.ones((B, N), bool)
