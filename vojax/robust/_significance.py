@@ -11,6 +11,7 @@ small, for any n, k and p, where a fixed least number of supporters is right for
 References: Moisan & Stival, "A probabilistic criterion to detect rigid point matches", IJCV 2004, eq. (11).
 """
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 
@@ -90,4 +91,4 @@ def even_odds(
     share = num_inliers.astype(inlier_density.dtype) / jnp.maximum(count, 1)
     share = jnp.clip(share, 0.01, 0.99)
     odds = share * inlier_density / jnp.maximum((1.0 - share) * outlier_density, 1e-30)
-    return jnp.sqrt(2.0 * jnp.log(jnp.clip(odds, 1.7, 1e8)))
+    return jax.lax.stop_gradient(jnp.sqrt(2.0 * jnp.log(jnp.clip(odds, 1.7, 1e8))))
