@@ -5,7 +5,7 @@ import pytest
 import scipy.optimize
 import scipy.stats
 
-from vojax.ba import Barron, Cauchy, GemanMcClure, Huber, Loss, Squared, mad_scale, robustify
+from vojax.ba import Barron, Cauchy, GaussianUniform, GemanMcClure, Huber, Loss, Squared, mad_scale, robustify
 
 # ρ(s) as the papers print it, with the constants used below.
 ORACLES = {
@@ -168,3 +168,18 @@ def test_derivatives_up_to_the_third_are_finite_however_far_out(name, dtype):
     third = jax.grad(jax.grad(jax.grad(cost)))
     values = jax.jit(jax.vmap(lambda r: (cost(r), third(r))))(jnp.geomspace(1.0, 1e18, 64, dtype=dtype))
     assert all(np.isfinite(v).all() for v in values)
+
+
+@pytest.mark.parametrize(
+    "loss", [Huber(1.3), Cauchy(1.7), GemanMcClure(2.1), Barron(-1.0, 0.8), GaussianUniform(3.0)], ids=str
+)
+def test_second_derivatives_of_small_residuals_are_those_of_the_loss(loss):
+    """Residuals of a model that fits all but exactly: ½ρ(r²) has the second derivative ρ′(0) there."""
+    r = jnp.float32(np.concatenate([[0.0], np.geomspace(1e-12, 1e-2, 30)]))
+
+    def half_loss(x):
+        (scaled,) = robustify((x,), loss)
+        return 0.5 * scaled * scaled
+
+    second = jax.jit(jax.vmap(jax.grad(jax.grad(half_loss))))(r)
+    np.testing.assert_allclose(second, float(loss.weight(jnp.zeros(()))), rtol=2e-2)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vojax import SE3, Result
+from vojax import SE3, SO3, Result
 from vojax.cameras import Pinhole, Rig
 from vojax.robust import (
     RansacOptions,
@@ -17,6 +17,7 @@ from vojax.robust import (
     estimate_rigid,
     estimate_rotation,
     estimate_similarity,
+    estimate_translation,
 )
 
 N = 24
@@ -26,6 +27,7 @@ RIG = Rig((CAMERA, CAMERA), SE3(jnp.float32([[1, 0, 0, 0, 0, 0, 0], [1, 0, 0, 0,
 KINDS = {
     estimate_absolute_pose: ((3, 2), (CAMERA,), 3),
     estimate_generalized_pose: ((3, 2), (np.arange(N) % 2, RIG), 3),
+    estimate_translation: ((3, 2), (CAMERA, SO3.identity()), 2),
     estimate_relative_pose: ((2, 2), (CAMERA, CAMERA), 5),
     estimate_rotation: ((2, 2), (CAMERA, CAMERA), 2),
     estimate_fundamental: ((2, 2), (), 7),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vojax.robust._significance import chance_in_image, is_significant
+from vojax.robust._significance import chance_in_image, even_odds, is_significant
 
 
 @pytest.mark.parametrize(("n", "p"), [(8, 0.01), (100, 2.3e-5), (1000, 2.3e-5), (1000, 0.01), (4138, 1e-4)])
@@ -48,3 +48,16 @@ def test_empty_and_flat_images_give_a_probability():
     for pixels, mask in ((np.zeros((5, 2)), np.zeros(5, bool)), (np.ones((5, 2)), np.ones(5, bool))):
         chance = chance_in_image(jnp.asarray(pixels, jnp.float32), jnp.asarray(mask), 3.0)
         assert 0.5 < chance <= 1
+
+
+def test_the_distance_of_even_odds_is_constant_to_differentiation():
+    """Also where nothing counts: the box of no pixels has no derivative."""
+    pixels = jnp.array([[1.0, 2.0], [jnp.inf, 3.0], [4.0, 5.0]])
+    for mask in (jnp.array([True, False, True]), jnp.zeros(3, bool)):
+
+        def cut(pixels, mask=mask):
+            chance = chance_in_image(pixels, mask, 3.0)
+            return even_odds(jnp.sum(mask), jnp.asarray(3), jnp.float32(0.16), chance)
+
+        assert 1.0 < cut(pixels) < 7.0
+        np.testing.assert_array_equal(jax.grad(cut)(pixels), 0.0)

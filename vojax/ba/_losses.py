@@ -172,18 +172,20 @@ def robustify(residual: tuple[Array, ...], loss: Loss, weight: Array | None = No
     Returns:
         Components r̃ = r √(w ρ(s)/s), for which ½‖r̃‖² = ½ w ρ(‖r‖²): acceptance tests then see the true cost.
 
-    Differentiability: both modes, including at r = 0, where r̃ ≈ √w r. So far out that derivatives of ρ(s)/s would
-        overflow (10⁶ standard deviations in float32), that ratio counts as constant.
+    Differentiability: both modes, twice, including at r = 0, where r̃ ≈ √(w ρ′(0)) r. So far out that derivatives of
+        ρ(s)/s would overflow (10⁶ standard deviations in float32), that ratio counts as constant.
     """
     if isinstance(loss, Squared):
         scaled = None if weight is None else safe_sqrt(weight)
     else:
         s = jnp.asarray(sum(component * component for component in residual))
         limits = jnp.finfo(jnp.result_type(s))
-        small, large = s < float(limits.tiny) ** 0.5, s > float(limits.max) ** 0.3125
+        small, large = s < float(limits.eps) ** 0.5, s > float(limits.max) ** 0.3125
         safe = jnp.where(small | large, 1.0, s)
         far = jax.lax.stop_gradient(s)
-        ratio = jnp.where(large, loss.rho(far) / far, jnp.where(small, 1.0, loss.rho(safe) / safe))
+        # Derivatives of ρ(s)/s divide by s³. To second order it is ρ′(s/2).
+        near = loss.weight(0.5 * jnp.where(small, s, 0.0))
+        ratio = jnp.where(large, loss.rho(far) / far, jnp.where(small, near, loss.rho(safe) / safe))
         scaled = safe_sqrt(ratio if weight is None else weight * ratio)
     return residual if scaled is None else tuple(component * scaled for component in residual)
 

@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vojax._numerics import cross3, dot3
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
@@ -43,6 +44,8 @@ from ._pairs import (
     usable_noise,
 )
 from ._significance import SQRT_TAU, chance_near_line, even_odds
+
+_SIDEWAYS = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0], np.float32)  # [t]× of a motion to the right
 
 
 class RelativePoseEstimator(eqx.Module):
@@ -151,7 +154,9 @@ def _estimate(
     view0, view1 = noisy_rays(unit, sigma_px)
     rays0, rays1 = jax.lax.stop_gradient([jnp.stack(view.ray, axis=1) for view in (view0, view1)])
     weight = consensus.inliers.astype(pixels0.dtype)
-    start, _ = pose_from_essential(consensus.model.reshape(3, 3).astype(pixels0.dtype), rays0, rays1, weight)
+    # A search without any hypothesis ends with zeros: give them a translation.
+    essential = jnp.where(jnp.any(consensus.model != 0), consensus.model, _SIDEWAYS).reshape(3, 3)
+    start, _ = pose_from_essential(essential.astype(pixels0.dtype), rays0, rays1, weight)
     start = jax.lax.stop_gradient(start)
     chance = chance_near_line(pixels1, mask, options.threshold_px)
     # All observations take part in the last refinement, weighted by how likely they are inliers: cutting them off at
