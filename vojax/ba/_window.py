@@ -134,11 +134,12 @@ def anchored(
         raise ValueError(f"the prior is about {prior.factor.shape[1]} keyframes, the window has {c}")
     dtype = jnp.result_type(points_world, measurements)
     free = jnp.arange(c) > 0 if fixed is None else ~jnp.asarray(fixed)
-    from_world = SE3(world_from_cam.wxyz_xyz[0]).inverse()
-    points = from_world.apply(points_world).T
-    start = WindowState(SE3((from_world @ world_from_cam).wxyz_xyz.astype(dtype)), points.astype(dtype))
+    anchor = SE3(world_from_cam.wxyz_xyz[0])
+    points = anchor.rotation().inverse().apply(points_world - anchor.translation()[None]).T
+    start = WindowState(SE3(relative_poses(anchor, world_from_cam).wxyz_xyz.astype(dtype)), points.astype(dtype))
     if prior is not None:
-        floats, rest = eqx.partition(prior.moved(from_world), eqx.is_inexact_array)
+        prior = eqx.tree_at(lambda p: p.world_from_cam, prior, relative_poses(anchor, prior.world_from_cam))
+        floats, rest = eqx.partition(prior, eqx.is_inexact_array)
         prior = eqx.combine(jax.tree.map(lambda leaf: leaf.astype(dtype), floats), rest)
     data = WindowData(
         tuple(measurements[..., i].astype(dtype) for i in range(d)),
@@ -149,3 +150,11 @@ def anchored(
         prior,
     )
     return jax.lax.stop_gradient(start), data
+
+
+def relative_poses(anchor: SE3, world_from_cam: SE3) -> SE3:
+    """`anchor⁻¹ world_from_cam`, positions subtracted first: R⁻¹p − R⁻¹a would lose their common digits in rounding."""
+    anchor = SE3(anchor.wxyz_xyz[None])
+    turn = anchor.rotation().inverse()
+    offset = turn.apply(world_from_cam.translation() - anchor.translation())
+    return SE3.from_rotation_and_translation(turn @ world_from_cam.rotation(), offset)

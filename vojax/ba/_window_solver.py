@@ -190,13 +190,12 @@ def _in_lanes(
     def begin(start: WindowState, data: WindowData, loss: Loss) -> tuple[WindowState, _State]:
         return start, solver.init(None, start, (data, loss), {}, None, None, frozenset())
 
-    def step(y: WindowState, state: _State, start: WindowState, data: WindowData, loss: Loss) -> Any:
-        del start
+    def step(y: WindowState, state: _State, data: WindowData, loss: Loss) -> Any:
         y, state, _ = solver.step(None, y, (data, loss), {}, state, frozenset())
         return y, state
 
     def body(lanes: _Lanes) -> _Lanes:
-        y, state = jax.vmap(step, in_axes=(0, 0, *axes))(lanes.y, lanes.state, *taken(lanes.window))
+        y, state = jax.vmap(step, in_axes=(0, 0, *axes[1:]))(lanes.y, lanes.state, *taken(lanes.window)[1:])
         steps = lanes.steps + 1
         converged = state.search_state.converged
         ended = converged | (steps >= max_steps)

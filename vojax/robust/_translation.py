@@ -85,7 +85,7 @@ class TranslationEstimator(eqx.Module):
         )
         normal = cross3(f0, f1)
         square = dot3(normal, normal)
-        proper = square > 1e-8  # rays less than 1e-4 rad apart
+        proper = square > 1e-8  # parallel lines meet nowhere: rays are to be 1e-4 rad apart
         inverse = 1.0 / jnp.where(proper, square, 1.0)
         edge = tuple(a - b for a, b in zip(x0, x1, strict=True))
         # λ0 = (edge × f1) · (f0 × f1) / |f0 × f1|², and λ1 with f0.
