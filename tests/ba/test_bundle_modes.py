@@ -30,6 +30,7 @@ def scene():
         return poses, points, np.asarray(pixels) + 0.5 * rng.normal(size=(C * P, 2)), frame, seen
 
 
+@pytest.mark.slow
 def test_structure_only_is_triangulation(scene, x64):
     poses, points, pixels, frame, seen = scene
     problem = bundle_problem(

@@ -408,6 +408,7 @@ def test_more_windows_than_lanes_end_as_they_do_a_few_at_a_time():
     np.testing.assert_allclose(together.world_from_cam.wxyz_xyz, joined.world_from_cam.wxyz_xyz, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_many_windows_may_start_from_the_same_poses():
     window, _ = simulate(34)
     stereo = RectifiedStereo(Pinhole(fx=FOCAL, fy=FOCAL, cx=CENTER[0], cy=CENTER[1]), BASELINE)

@@ -169,6 +169,7 @@ def test_enough_corners_everywhere(sequence, k):
     assert np.mean(left == 255) < 0.12
 
 
+@pytest.mark.slow
 def test_knobs_break_the_assumptions(sequence):
     left = sequence.images(4)[0].astype(float)
     flat = SyntheticStereoSequence(frames=8, texture_contrast=0.0).images(4)[0].astype(float)
@@ -211,6 +212,18 @@ def test_a_lap_closes_and_bends_fast():
     assert 4.0 < angles.max() < 6.0
 
 
+def test_a_late_right_picture_is_that_of_a_later_time():
+    exact = SyntheticStereoSequence(frames=4, noise_gray=0.0)
+    late = SyntheticStereoSequence(frames=4, noise_gray=0.0, right_late=1.0)
+    np.testing.assert_array_equal(late.images(2)[0], exact.images(2)[0])
+    np.testing.assert_array_equal(late.images(2)[1], exact.images(3)[1])
+    half = SyntheticStereoSequence(frames=4, noise_gray=0.0, right_late=0.5).images(3)[1]
+    assert np.abs(half.astype(float) - exact.images(3)[1]).mean() > 1.0
+    with pytest.raises(ValueError, match=r"right_late is -0\.1; expected at least 0"):
+        SyntheticStereoSequence(frames=1, right_late=-0.1)
+
+
+@pytest.mark.slow
 def test_an_open_shutter_blurs_along_the_motion():
     sharp = SyntheticStereoSequence(frames=26, noise_gray=0.0)
     blurred = SyntheticStereoSequence(frames=26, noise_gray=0.0, shutter=0.5)

@@ -92,12 +92,22 @@ def test_invalid_rows_are_finite_and_marked(make_stereo_pair):
     pixels = np.array([[np.nan, 5], [-3, 10], [0, 0], [319, 119], [1e9, 7], [150.2, 60.7]])
     matches = match_stereo_rows(left, right, pixels)
     np.testing.assert_array_equal(matches.valid, [False] * 5 + [True])
-    for field in matches[:3]:
+    for field in (*matches[:3], matches.row_offset):
         assert np.isfinite(field).all()
         assert field.dtype == np.float32
     assert (matches.disparity[:5] == 0).all()
     assert (matches.quality[:5] == 0).all()
     assert (matches.sigma[:5] == 1).all()
+    assert (matches.row_offset[:5] == 0).all()
+
+
+def test_the_row_offset_is_measured(make_stereo_pair):
+    left, right = make_stereo_pair(np.random.default_rng(12), 12.5)
+    pixels = np.stack(np.meshgrid(np.arange(60, 280, 20.0), np.arange(20, 100, 12.0)), axis=-1).reshape(-1, 2)
+    for rows in (0, 1, -1):
+        matches = match_stereo_rows(left, np.roll(right, rows, axis=0), pixels)
+        assert matches.valid.mean() > 0.9
+        np.testing.assert_allclose(np.median(matches.row_offset[matches.valid]), rows, atol=0.1)
 
 
 @pytest.mark.parametrize("shape", [(100, 200), (20, 20), (3, 3), (1, 1)])
@@ -106,7 +116,7 @@ def test_blank_and_tiny_images(shape):
     matches = match_stereo_rows(blank, blank, np.array([[shape[1] / 2, shape[0] / 2]]))
     assert not matches.valid.any()
     assert np.isfinite(matches.sigma).all()
-    assert [len(field) for field in match_stereo_rows(blank, blank, np.empty((0, 2)))] == [0] * 4
+    assert [len(field) for field in match_stereo_rows(blank, blank, np.empty((0, 2)))] == [0] * 5
 
 
 def test_bad_input():

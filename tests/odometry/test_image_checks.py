@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from vojax.odometry import Flag, ImageChecks, consensus_flags, image_flags, is_static, track_flags
+from vojax.odometry import (
+    Flag,
+    ImageChecks,
+    consensus_flags,
+    image_flags,
+    is_static,
+    synchrony_flags,
+    track_flags,
+)
 
 
 def textured(seed=0, low=20, high=230):
@@ -49,6 +57,19 @@ def test_agreement():
     assert consensus_flags(80, 100, 12) == ()
     assert consensus_flags(30, 100, 12) == (Flag.consensus,)
     assert consensus_flags(11, 12, 12) == (Flag.consensus,)
+
+
+@pytest.mark.parametrize(
+    ("late", "deviation", "flags"),
+    [
+        (0.01, 0.001, ()),
+        (0.03, 0.01, ()),  # it may be noise
+        (0.03, 0.005, (Flag.unsynchronised,)),
+        (-0.5, 0.05, (Flag.unsynchronised,)),
+    ],
+)
+def test_the_time_between_left_and_right(late, deviation, flags):
+    assert synchrony_flags(late, deviation) == flags
 
 
 @pytest.mark.parametrize(

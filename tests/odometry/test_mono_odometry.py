@@ -183,6 +183,7 @@ def test_motion_from_pairs_of_pixels(street, kind):
     assert np.mean(inliers[np.asarray(usable)[: len(points)] & ~wrong]) > 0.9
 
 
+@pytest.mark.slow
 def test_window_triangulates_and_adjusts(street):
     rng = np.random.default_rng(5)
     points = scene(rng)

@@ -198,6 +198,15 @@ def test_images_that_share_nothing_are_bridged_and_said(street):
     assert {Flag.overlap, Flag.consensus} & set(lost.flags)
 
 
+def test_pictures_of_two_times_are_said():
+    # Late by a twentieth of a frame: the rows hardly show it, and the path is 5 % off.
+    sequence = SyntheticStereoSequence(frames=12, right_late=0.05)
+    estimates = drive(sequence)
+    assert measure(sequence, estimates).drift_percent > 2.0
+    assert Flag.unsynchronised in estimates[-1].flags
+    assert not any(Flag.unsynchronised in e.flags for e in estimates[:3])
+
+
 def test_a_camera_at_rest_stays_and_makes_no_keyframes(street):
     estimates = drive(street, frames=[0, 1, 2, *[3] * 8, 4, 5])
     at_rest = estimates[4:11]

@@ -157,6 +157,7 @@ def test_errors_follow_the_covariance():
     assert scipy.stats.kstest(values, "chi2", args=(6,)).pvalue > 1e-3
 
 
+@pytest.mark.slow
 def test_the_stated_noise_scales_the_covariance(half_wrong):
     problem, found = half_wrong
     double = solve(problem, sigma_px=2.0)

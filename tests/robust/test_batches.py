@@ -38,6 +38,7 @@ def test_keys_vary_and_observations_are_shared(problems):
         np.testing.assert_allclose(batch[0][i], pose, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_every_problem_stops_when_it_is_done_in_a_batch_of_batches(problems):
     keys = jax.random.split(jax.random.key(2), (3, 4))
     many = jax.vmap(jax.vmap(estimate, (0, 0, 0, None)), (None, None, 0, 0))

@@ -47,6 +47,7 @@ def test_guided_samples_are_free_of_outliers_more_often():
     assert both > max(share(detector), share(matcher))
 
 
+@pytest.mark.slow
 def test_a_search_that_is_guided_well_stops_sooner_and_one_that_is_misled_does_not():
     """A rigid motion, 30 % right: uniform samples of three need 253 for 99.9 %."""
     keys = jax.random.split(jax.random.key(4), 20)

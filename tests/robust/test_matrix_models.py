@@ -107,6 +107,7 @@ def two_views():
     return jax.jit(jax.vmap(lambda key: simulate_relative_pose(key, N, outlier_fraction=0.3, sigma_px=1.0)))(keys)
 
 
+@pytest.mark.slow
 def test_fundamental_is_more_accurate_than_poselib(two_views):
     import poselib
 

@@ -79,6 +79,7 @@ def test_scenes_planes_and_turns_are_told_apart(mixed):
     assert abs(np.median(found.sigma_px) - 1.0) < 0.05
 
 
+@pytest.mark.slow
 def test_each_estimate_is_that_of_its_scene(mixed):
     found, rotations, translations = mixed
     kinds = np.array(MIXED)

@@ -60,6 +60,7 @@ def test_two_bodies_have_two_motions():
             assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 def test_one_body_and_none():
     points0, points1, labels, _ = moving_bodies(3, shares=(0.6, 0.0))
     found = two_motions(jax.random.key(0), points0, points1, jnp.ones(N, bool))

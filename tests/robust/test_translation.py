@@ -97,6 +97,7 @@ def test_an_uncertain_rotation_is_carried_into_the_position():
     assert np.mean(nees(errors(alone, problem)[:, :3], alone.covariance[:, :3, :3])) > 4.0
 
 
+@pytest.mark.slow
 def test_a_known_rotation_makes_the_position_more_certain():
     problem = simulate(23, 0.3)
     camera, options = Pinhole(**CAMERA), RansacOptions(threshold_px=THRESHOLD)
@@ -132,6 +133,7 @@ def test_gradients_are_those_of_the_refined_position():
             np.testing.assert_allclose(float(jnp.sum(gradient * direction)), expected, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradients_do_not_see_what_is_masked():
     camera = Pinhole(**CAMERA)
     problem = simulate_absolute_pose(jax.random.key(6), 24, sigma_px=0.5)

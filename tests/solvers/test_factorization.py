@@ -178,6 +178,7 @@ def test_five_rounds_are_enough_for_distant_scenes(x64):
     assert np.median(errors[1]) > 1e-3
 
 
+@pytest.mark.slow
 def test_perspective_with_gaps(x64):
     tracks, *_, points = perspective_images(5.0, views=8, count=25)
     mask = band(8, 25, 6)
@@ -222,7 +223,10 @@ def true_slot_total(weights, points):
     return total
 
 
-@PROJECTIONS
+@pytest.mark.parametrize(
+    "projection",
+    ["paraperspective", *(pytest.param(name, marks=pytest.mark.slow) for name in ("orthographic", "weak_perspective"))],
+)
 def test_derivative_of_metric_factorization(projection, x64):
     tracks, _, _, points = parallel_images(projection, noise=0.003)
     total = true_slot_total(np.random.default_rng(6).normal(size=points.shape), points)
@@ -248,6 +252,7 @@ def test_derivative_of_perspective_factorization(x64):
     np.testing.assert_allclose(jax.grad(function)(tracks), numeric, atol=1e-5 * np.abs(numeric).max())
 
 
+@pytest.mark.slow
 def test_batches_equal_a_loop(x64):
     tracks = np.stack([parallel_images("weak_perspective", seed=k, noise=0.01)[0] for k in range(3)])
     mask = np.random.default_rng(4).uniform(size=tracks.shape[:3]) < 0.8

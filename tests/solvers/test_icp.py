@@ -15,6 +15,10 @@ from vojax.solvers._icp import METHODS
 
 N, M, BATCH = 300, 400, 64
 each_method = pytest.mark.parametrize("method", METHODS)
+# Each compiles for long; one method stands for all in every run.
+each_in_turn = pytest.mark.parametrize(
+    "method", [m if m == "point_to_plane" else pytest.param(m, marks=pytest.mark.slow) for m in METHODS]
+)
 
 
 def aligner(method):
@@ -55,7 +59,7 @@ def errors(result, motions):
     return motion_errors(pose_matrices(result.frame1_from_frame0.wxyz_xyz), motions)
 
 
-@each_method
+@each_in_turn
 def test_aligns_copies_exactly(method):
     points0, points1, vectors, motions = problems(method, same=True)
     result = align(method, points0, points1, vectors)
@@ -102,7 +106,7 @@ def test_equals_rounds_with_a_tree():
     assert same >= 15  # a match at the limit may fall on either side
 
 
-@each_method
+@each_in_turn
 def test_padding_changes_nothing(method):
     points0, points1, vectors, _ = problems(method, seed=3)
     mask0, mask1 = np.arange(N) < np.arange(100, 100 + BATCH)[:, None] + 100, np.arange(M) < 350
@@ -133,6 +137,7 @@ def test_partial_overlap():
     assert (result.matches[:, :60] == -1).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_a_good_start_helps():
     points0, points1, vectors, motions = problems("point_to_plane", seed=6)
     turn = SE3.exp(jnp.asarray([4.0, 0.0, 0.0, 0.0, 0.0, 1.5]))

@@ -155,6 +155,7 @@ def weighted_sum(points0, points1, weights):
     return jnp.sum(models.as_matrix() * jnp.arange(1.0, 17.0).reshape(1, 4, 4))
 
 
+@pytest.mark.slow
 def test_gradients_equal_central_differences(x64):
     points0, points1, *_ = alignment_problems(2, 6, noise=0.3, seed=10)
     weights = weights_for(2, 6, 10)

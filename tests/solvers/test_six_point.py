@@ -80,6 +80,7 @@ def rotation(vector):
     return scipy.linalg.expm(np.cross(np.eye(3), vector))
 
 
+@pytest.mark.slow
 def test_noisy_solution_is_the_least_squares_one_of_scipy(x64):
     rng = np.random.default_rng(5)
     first, second, truth = bearing_problems(30, 6, seed=5)

@@ -23,7 +23,8 @@ class SyntheticStereoSequence:
     frames are kept. The same arguments give the same pictures; sequences of different lengths share their first frames.
 
     Each of the four assumptions that visual odometry makes can be broken: enough light (`lighting_amplitude`), a static
-    scene (`moving_cars`), enough texture (`texture_contrast`) and enough overlap (`stride`).
+    scene (`moving_cars`), enough texture (`texture_contrast`) and enough overlap (`stride`); and that of stereo, one
+    time for both pictures (`right_late`).
 
     Args:
         frames: Number of frames.
@@ -34,6 +35,7 @@ class SyntheticStereoSequence:
         baseline: Distance between the cameras, metres.
         lap: Drive around the block, and on and on for more than 500 frames.
         shutter: Share of 0.1 s in which the shutter is open: the motion blur of a picture.
+        right_late: Share of 0.1 s by which the right picture is taken after the left one.
         stride: Path steps of 0.1 s from one frame to the next.
         lighting_amplitude: Natural logarithm of the largest change of exposure, which swings once in 2.4 s.
         moving_cars: Number of cars driving along: the first goes ahead in the same lane, the second comes towards the
@@ -71,6 +73,7 @@ class SyntheticStereoSequence:
         baseline: float = 0.54,
         lap: bool = False,
         shutter: float = 0.0,
+        right_late: float = 0.0,
         stride: int = 1,
         lighting_amplitude: float = 0.0,
         moving_cars: int = 0,
@@ -90,6 +93,7 @@ class SyntheticStereoSequence:
             ("texture_contrast", texture_contrast, 0),
             ("baseline", baseline, 0),
             ("shutter", shutter, 0),
+            ("right_late", right_late, 0),
         ):
             if value < least:
                 raise ValueError(f"{name} is {value}; expected at least {least}")
@@ -106,6 +110,7 @@ class SyntheticStereoSequence:
         self._contrast = texture_contrast
         self._moving_cars = moving_cars
         self._shutter = shutter
+        self._right_late = right_late
 
         steps = np.arange(frames) * stride
         self.times = steps * 0.1
@@ -188,10 +193,11 @@ class SyntheticStereoSequence:
 
     def _exposure(self, k: int, eye: int) -> _render.View:
         """What the camera sees while the shutter is open, the middle of which is the frame's time."""
-        if not self._shutter:
+        late = eye * self._right_late
+        if not self._shutter and not late:
             return self._view(k, eye, self._street_from_cam[k])
-        part = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
-        poses = _street.street_from_camera(self._path, k * self.stride + self._shutter * part, self.seed)
+        part = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5 if self._shutter else np.zeros(1)
+        poses = _street.street_from_camera(self._path, k * self.stride + late + self._shutter * part, self.seed)
         return jax.tree.map(lambda *x: np.stack(x), *(self._view(k, eye, pose) for pose in poses))
 
     def _view(self, k: int, eye: int, pose: np.ndarray) -> _render.View:

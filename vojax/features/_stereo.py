@@ -75,12 +75,14 @@ class StereoMatches(NamedTuple):
         quality: Correlation of the windows, at most 1; 0 where not valid.
         sigma: Standard deviation of the disparity in pixels; 1 where not valid.
         valid: True where a unique and consistent match was found.
+        row_offset: v_right − v_left in pixels, drawn towards 0 by `StereoOptions.row_sigma_px`; 0 where not valid.
     """
 
     disparity: Float32[np.ndarray, "n"]
     quality: Float32[np.ndarray, "n"]
     sigma: Float32[np.ndarray, "n"]
     valid: Bool[np.ndarray, "n"]
+    row_offset: Float32[np.ndarray, "n"]
 
 
 def match_stereo_rows(
@@ -110,7 +112,7 @@ def match_stereo_rows(
     points = check_pixels(pixels)
     n = len(points)
     disparity, quality, valid = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, bool)
-    sigma = np.ones(n, np.float32)
+    sigma, rows = np.ones(n, np.float32), np.zeros(n, np.float32)
     index = np.flatnonzero(inside(points, left.shape, options.radius_px + 1))
     if len(index):
         coarse, ok = _search_coarse(left, right, points[index], options)
@@ -122,12 +124,14 @@ def match_stereo_rows(
         index, whole, row_offset = index[ok], whole[ok], row_offset[ok]
     if len(index):
         left, right = spline_coefficients(left), spline_coefficients(right)
-        found, correlation, deviation, ok = _refine(left, right, border, points[index], whole, row_offset, options)
-        disparity[index], quality[index], sigma[index] = found, correlation, deviation
+        found, correlation, deviation, row_offset, ok = _refine(
+            left, right, border, points[index], whole, row_offset, options
+        )
+        disparity[index], quality[index], sigma[index], rows[index] = found, correlation, deviation, row_offset
         valid[index[ok]] = True
     return StereoMatches(
         np.where(valid, disparity, np.float32(0)), np.where(valid, quality, np.float32(0)),
-        np.where(valid, sigma, np.float32(1)), valid,
+        np.where(valid, sigma, np.float32(1)), valid, np.where(valid, rows, np.float32(0)),
     )  # fmt: skip
 
 
@@ -236,7 +240,7 @@ def _search_fine(left, right, border, points, disparity, options: StereoOptions)
 
 
 def _refine(left, right, border, points, disparity, row_offset, options: StereoOptions):
-    """Sub-pixel disparity, correlation, standard deviation and acceptance."""
+    """Sub-pixel disparity, correlation, standard deviation, row offset and acceptance."""
     radius, margin = options.radius_px, 4
     size = 2 * radius + 1
     n = len(points)
@@ -309,4 +313,4 @@ def _refine(left, right, border, points, disparity, row_offset, options: StereoO
         (np.abs(current - disparity) < 1.5) & (np.abs(rows - row_offset) < 1.2) & (current >= options.min_disparity_px)
     )
     ok &= (current <= options.max_disparity_px) & (points[:, 0] - current >= radius)
-    return current.astype(np.float32), correlation.astype(np.float32), deviation.astype(np.float32), ok
+    return (*(found.astype(np.float32) for found in (current, correlation, deviation, rows)), ok)

@@ -6,6 +6,7 @@ from ._image_checks import ImageChecks as ImageChecks
 from ._image_checks import consensus_flags as consensus_flags
 from ._image_checks import image_flags as image_flags
 from ._image_checks import is_static as is_static
+from ._image_checks import synchrony_flags as synchrony_flags
 from ._image_checks import track_flags as track_flags
 from ._keyframes import KeyframeOptions as KeyframeOptions
 from ._keyframes import is_keyframe as is_keyframe

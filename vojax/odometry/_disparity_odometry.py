@@ -18,12 +18,13 @@ from vojax.features import DescriptorOptions, DetectorOptions, StereoMatches, Tr
 from vojax.lie import SE3
 
 from ._frame import Flag, FrameEstimate
-from ._image_checks import ImageChecks, consensus_flags, image_flags, track_flags
+from ._image_checks import ImageChecks, consensus_flags, image_flags, synchrony_flags, track_flags
 from ._keyframes import KeyframeOptions, is_keyframe
 from ._motion import Motion, MotionOptions, RigidMotionOptions, StereoFeatures, predicted_pixels, stereo_motion
 from ._rectification import DisparityCalibration
 from ._rigid_motion import rigid_motion
 from ._sliding_window import Keyframe, SlidingWindow, WindowOptions, orthonormal
+from ._synchrony import Synchrony
 from ._tracks import Features, front_end, given_features, room_for
 
 
@@ -98,6 +99,7 @@ class DisparityOdometry:
         self._motion = SE3.identity()  # cam1_from_cam0 of one frame
         self._gap = 1  # frames from the reference to the next
         self._count = 0
+        self._synchrony = Synchrony.prior()
         self.calibration = DisparityCalibration.prior()
 
     def skip(self) -> FrameEstimate:
@@ -189,6 +191,7 @@ class DisparityOdometry:
                 return self._bridge(reasons)
             return self._start_again(frame, reasons)
 
+        flags += self._check_synchrony(reference, frame, inliers)
         self.calibration = motion.calibration
         pose = orthonormal(self._pose @ np.asarray(_inverse_matrix(motion.cam1_from_cam0), np.float64))
         static = Flag.static in flags
@@ -237,6 +240,14 @@ class DisparityOdometry:
         if isinstance(options, RigidMotionOptions):
             return rigid_motion(*arguments, options)
         return stereo_motion(*arguments, options)
+
+    def _check_synchrony(self, reference: _Frame, frame: _Frame, inliers: np.ndarray) -> tuple[Flag, ...]:
+        matches = frame.measured.matches
+        matched = inliers[matches.valid[inliers]]
+        pixels = frame.measured.pixels[matched]
+        moved = pixels - reference.measured.pixels[frame.features.rows[matched]]
+        self._synchrony = self._synchrony.add(pixels, moved[:, 1] / self._gap, matches.row_offset[matched])
+        return synchrony_flags(*self._synchrony.late(), self._options.checks)
 
     def _ahead(self) -> np.ndarray:
         """The pose now, should the motion have repeated itself since the reference."""

@@ -15,6 +15,7 @@ class Flag(enum.StrEnum):
     overlap = "too little overlap with the frame before"
     static = "the camera stands still"
     consensus = "the tracks agree on no motion"
+    unsynchronised = "left and right were not taken at the same time"
     unreadable = "the frame could not be read"
     restarted = "started anew: the scale is that of the motion before, to its uncertainty"
 

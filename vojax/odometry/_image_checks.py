@@ -26,6 +26,8 @@ class ImageChecks:
             four fifths of the field of view leaves.
         min_agreement: Least share of the usable tracks that must agree: below a third, two other motions may each
             explain as many.
+        max_late: Largest time between the images of a pair, as a share of the time between frames, beyond which it is
+            said once it is sure by five standard deviations. A path drifts by about that share of its length.
         sigma_px: Standard deviation of a tracked position. Of a camera at rest half of the tracks move by less than
             √(2 ln 2) = 1.18 of it, the median of a Rayleigh distribution.
     """
@@ -35,10 +37,11 @@ class ImageChecks:
     max_clipped: float = 0.5
     min_overlap: float = 0.2
     min_agreement: float = 1.0 / 3.0
+    max_late: float = 0.02
     sigma_px: float = 0.25
 
     def __post_init__(self) -> None:
-        for name in ("max_clipped", "min_overlap", "min_agreement"):
+        for name in ("max_clipped", "min_overlap", "min_agreement", "max_late"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: expected a share between 0 and 1")
         if not 0 <= self.clipped_margin < 128:
@@ -115,3 +118,17 @@ def consensus_flags(
     """
     enough = num_inliers >= min_inliers and num_inliers >= checks.min_agreement * num_usable
     return () if enough else (Flag.consensus,)
+
+
+def synchrony_flags(late: float, deviation: float, checks: ImageChecks = ImageChecks()) -> tuple[Flag, ...]:
+    """Judge the time between the images of a pair.
+
+    Args:
+        late: How much later the right one was taken, as a share of the time between frames.
+        deviation: Its standard deviation.
+        checks: Thresholds.
+
+    Returns:
+        `unsynchronised` where it is too long, and surely so.
+    """
+    return (Flag.unsynchronised,) if abs(late) > max(checks.max_late, 5.0 * deviation) else ()

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from vojax._numerics import propagated, symmetric_inverse
 from vojax._types import Array, Bool, Float, Int
 from vojax.ba import GemanMcClure, LMOptions, refine_absolute_pose
-from vojax.cameras import RectifiedStereo
-from vojax.lie import SE3
-from vojax.robust import RansacOptions, search_absolute_pose
+from vojax.cameras import RectifiedStereo, Rig
+from vojax.lie import SE3, SO3
+from vojax.robust import RansacOptions, search_generalized_pose
 
 from ._rectification import DisparityCalibration, corrected, disparity_terms
 
@@ -154,8 +154,9 @@ def stereo_motion(
     near = usable & (disparity0 > options.ransac_min_disparity_px)
     # A scene without near points still makes hypotheses from what there is.
     near = jnp.where(jnp.sum(near) >= 20, near, usable)
-    rough, consensus = search_absolute_pose(points0, second[:, :2], stereo.camera, near, quality, key, options.ransac)
-    found = jnp.sum(consensus.inliers) > 3
+    seen = jnp.stack([near, near & features1.has_disparity])
+    rough, agreeing = _search_in_both_images(points0, second, seen, quality, stereo, key, options.ransac)
+    found = jnp.sum(agreeing) > 3
     pose = SE3(jnp.where(found, rough.wxyz_xyz, guess.wxyz_xyz))
 
     residuals = TransferResiduals(first, second, features0, features1, options, stereo)
@@ -177,6 +178,33 @@ def stereo_motion(
     # The covariances depend on the pose a little: twice is enough.
     pose, all_covariances = jax.lax.scan(refine, pose, None, length=2)
     return residuals.conclude(pose, all_covariances[-1], usable, found, calibration, offsets)
+
+
+def _search_in_both_images(
+    points0: Float[Array, "n 3"],
+    second: Float[Array, "n 3"],
+    seen: Bool[Array, "2 n"],
+    quality: Float[Array, " n"],
+    stereo: RectifiedStereo,
+    key: Array,
+    options: RansacOptions,
+) -> tuple[SE3, Bool[Array, " n"]]:
+    """Generalised P3P on the left and the right image of the second frame; the points that agree in one of them."""
+    zero = jnp.zeros_like(stereo.baseline)
+    centers = jnp.stack([jnp.stack([zero, zero, zero]), jnp.stack([-stereo.baseline, zero, zero])])
+    rig = Rig((stereo.camera, stereo.camera), SE3.from_rotation_and_translation(SO3.identity((2,)), centers))
+    n = len(points0)
+    rough, consensus = search_generalized_pose(
+        jnp.concatenate([points0, points0]),
+        jnp.concatenate([second[:, :2], second[:, 2:0:-1]]),
+        jnp.repeat(jnp.arange(2), n),
+        rig,
+        seen.reshape(-1),
+        jnp.concatenate([quality, quality]),
+        key,
+        options,
+    )
+    return rough, jnp.any(consensus.inliers.reshape(2, n), axis=0)
 
 
 class TransferResiduals(eqx.Module):

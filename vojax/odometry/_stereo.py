@@ -141,6 +141,7 @@ class StereoOdometry:
             valid.astype(np.float32),
             np.where(valid, sigma, np.float32(1)),
             valid,
+            np.zeros_like(disparity),
         )
         return self._odometry.step_tracks(ids, Measured(measurements[:, :2], matches))
 

@@ -7,6 +7,7 @@ from ._calibrated_plane import estimate_rotation as estimate_rotation
 from ._engine import Consensus as Consensus
 from ._estimate import Estimate as Estimate
 from ._generalized_pose import estimate_generalized_pose as estimate_generalized_pose
+from ._generalized_pose import search_generalized_pose as search_generalized_pose
 from ._hypotheses import score_hypotheses as score_hypotheses
 from ._hypotheses import squared_errors as squared_errors
 from ._matrix_models import estimate_fundamental as estimate_fundamental

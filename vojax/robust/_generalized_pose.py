@@ -29,7 +29,7 @@ from vojax.solvers import gp3p
 from ._alignment import motion_of_entries
 from ._buckets import in_bucket
 from ._conclude import conclude
-from ._engine import search
+from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
 from ._pairs import (
@@ -168,16 +168,7 @@ def _estimate(
     dtype = points_world.dtype
     centered, center = about_middle(points_world, mask)
 
-    local, local_pixels, local_rig = single_precision((centered, pixels, rig))
-    estimator = GeneralizedPoseEstimator(
-        local,
-        local_forms(local_rig, local_pixels, camera_index),
-        *local_rig.rays(local_pixels, camera_index),
-        limit=options.threshold_px**2,
-        local_steps=options.local_steps,
-    )
-    consensus = search(estimator, mask, single_precision(quality), key, options)
-    start: Any = jax.tree.map(lambda x: x.astype(dtype), motion_of_entries(consensus.model, with_scale=False))
+    start, consensus = search_generalized_pose(centered, pixels, camera_index, rig, mask, quality, key, options)
 
     sigma = root_mean_square(sigma_px, mask)
     # Each camera's image counts for chance as if all pixels were in one.
@@ -213,3 +204,34 @@ def _estimate(
         chance=chance,
         limit=options.threshold_px**2,
     )
+
+
+def search_generalized_pose(
+    points_world: Float[Array, "n 3"],
+    pixels: Float[Array, "n 2"],
+    camera_index: Int[Array, " n"],
+    rig: Rig,
+    mask: Bool[Array, " n"],
+    quality: Float[ArrayLike, " n"] | None,
+    key: PRNGKeyArray | Array,
+    options: RansacOptions,
+) -> tuple[SE3, Consensus]:
+    """Search a rig's pose without the last refinement: the first half of `estimate_generalized_pose`, for use in jit.
+
+    It runs in float32, so the points should not be far from the origin for their extent; nothing in it is
+    differentiated.
+
+    Returns:
+        `rig_from_world` in the dtype of the points, the identity where nothing was found; and the consensus.
+    """
+    local, local_pixels, local_rig = single_precision((points_world, pixels, rig))
+    estimator = GeneralizedPoseEstimator(
+        local,
+        local_forms(local_rig, local_pixels, camera_index),
+        *local_rig.rays(local_pixels, camera_index),
+        limit=options.threshold_px**2,
+        local_steps=options.local_steps,
+    )
+    consensus = search(estimator, mask, single_precision(quality), key, options)
+    pose: Any = motion_of_entries(consensus.model.astype(points_world.dtype), with_scale=False)
+    return pose, consensus
