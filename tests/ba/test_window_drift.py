@@ -12,7 +12,7 @@ STUDY = pathlib.Path(__file__).parents[2] / "benchmarks" / "study_windowed_drift
 
 
 @pytest.mark.slow
-def test_windows_drift_less_than_frame_to_frame_in_both_precisions():
+def test_windows_that_remember_drift_least_in_both_precisions():
     spec = importlib.util.spec_from_file_location("study_windowed_drift", STUDY)
     assert spec is not None
     assert spec.loader is not None
@@ -22,8 +22,10 @@ def test_windows_drift_less_than_frame_to_frame_in_both_precisions():
         drives = study.draw(seeds=8, frames=51, step=2.0)
         double = study.end_errors(drives, 2.0, jnp.float64)
         single = study.end_errors(drives, 2.0, jnp.float32)
-    _, frame_to_frame, forgetful, remembering = (study.rms(error) for error in double)
-    assert forgetful < frame_to_frame
-    assert remembering < 0.8 * frame_to_frame
+    points_exact, frame_to_frame, forgetful, remembering = (study.rms(error) for error in double)
+    assert frame_to_frame < points_exact
+    assert remembering < 0.8 * points_exact
+    # Without the landmarks that began before it, a window knows less of its first motion than two frames do.
+    assert remembering < 0.8 * forgetful
     for one, two in zip(single, double, strict=True):
-        np.testing.assert_allclose(study.rms(one), study.rms(two), rtol=0.02)
+        np.testing.assert_allclose(study.rms(one), study.rms(two), rtol=0.01)
