@@ -24,6 +24,7 @@ def test_windows_that_remember_drift_least_in_both_precisions():
         single = study.end_errors(drives, 2.0, jnp.float32)
     points_exact, frame_to_frame, forgetful, remembering = (study.rms(error) for error in double)
     assert frame_to_frame < points_exact
+    assert remembering < frame_to_frame
     assert remembering < 0.8 * points_exact
     # Without the landmarks that began before it, a window knows less of its first motion than two frames do.
     assert remembering < 0.8 * forgetful

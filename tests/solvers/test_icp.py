@@ -15,8 +15,8 @@ from vojax.solvers._icp import METHODS
 
 N, M, BATCH = 300, 400, 64
 each_method = pytest.mark.parametrize("method", METHODS)
-# Each compiles for long; one method stands for all in every run.
-each_in_turn = pytest.mark.parametrize(
+# Each compiles for long: one stands for all but in slow runs.
+one_or_each_method = pytest.mark.parametrize(
     "method", [m if m == "point_to_plane" else pytest.param(m, marks=pytest.mark.slow) for m in METHODS]
 )
 
@@ -59,7 +59,7 @@ def errors(result, motions):
     return motion_errors(pose_matrices(result.frame1_from_frame0.wxyz_xyz), motions)
 
 
-@each_in_turn
+@one_or_each_method
 def test_aligns_copies_exactly(method):
     points0, points1, vectors, motions = problems(method, same=True)
     result = align(method, points0, points1, vectors)
@@ -106,7 +106,7 @@ def test_equals_rounds_with_a_tree():
     assert same >= 15  # a match at the limit may fall on either side
 
 
-@each_in_turn
+@one_or_each_method
 def test_padding_changes_nothing(method):
     points0, points1, vectors, _ = problems(method, seed=3)
     mask0, mask1 = np.arange(N) < np.arange(100, 100 + BATCH)[:, None] + 100, np.arange(M) < 350

@@ -35,7 +35,7 @@ class SyntheticStereoSequence:
         baseline: Distance between the cameras, metres.
         lap: Drive around the block, and on and on for more than 500 frames.
         shutter: Share of 0.1 s in which the shutter is open: the motion blur of a picture.
-        right_late: Share of 0.1 s by which the right picture is taken after the left one.
+        right_late: Share of 0.1 s by which the right picture is taken after the left one; cars stay where they are.
         stride: Path steps of 0.1 s from one frame to the next.
         lighting_amplitude: Natural logarithm of the largest change of exposure, which swings once in 2.4 s.
         moving_cars: Number of cars driving along: the first goes ahead in the same lane, the second comes towards the

@@ -76,6 +76,7 @@ class StereoMatches(NamedTuple):
         sigma: Standard deviation of the disparity in pixels; 1 where not valid.
         valid: True where a unique and consistent match was found.
         row_offset: v_right − v_left in pixels, drawn towards 0 by `StereoOptions.row_sigma_px`; 0 where not valid.
+            Sources of disparities without rows, such as depths, fill it with nan.
     """
 
     disparity: Float32[np.ndarray, "n"]

@@ -99,7 +99,7 @@ class DisparityOdometry:
         self._motion = SE3.identity()  # cam1_from_cam0 of one frame
         self._gap = 1  # frames from the reference to the next
         self._count = 0
-        self._synchrony = Synchrony.prior()
+        self.synchrony = Synchrony.prior()
         self.calibration = DisparityCalibration.prior()
 
     def skip(self) -> FrameEstimate:
@@ -243,11 +243,11 @@ class DisparityOdometry:
 
     def _check_synchrony(self, reference: _Frame, frame: _Frame, inliers: np.ndarray) -> tuple[Flag, ...]:
         matches = frame.measured.matches
-        matched = inliers[matches.valid[inliers]]
+        matched = inliers[matches.valid[inliers] & np.isfinite(matches.row_offset[inliers])]
         pixels = frame.measured.pixels[matched]
         moved = pixels - reference.measured.pixels[frame.features.rows[matched]]
-        self._synchrony = self._synchrony.add(pixels, moved[:, 1] / self._gap, matches.row_offset[matched])
-        return synchrony_flags(*self._synchrony.late(), self._options.checks)
+        self.synchrony = self.synchrony.add(pixels, moved[:, 1] / self._gap, matches.row_offset[matched])
+        return synchrony_flags(*self.synchrony.late(), self._options.checks)
 
     def _ahead(self) -> np.ndarray:
         """The pose now, should the motion have repeated itself since the reference."""

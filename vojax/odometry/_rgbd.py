@@ -174,7 +174,7 @@ def disparities_of_depths(
     n, radius = len(pixels), options.radius_px
     if depth is None or n == 0:
         zeros = np.zeros(n, np.float32)
-        return StereoMatches(zeros, zeros, np.ones(n, np.float32), np.zeros(n, bool), zeros)
+        return StereoMatches(zeros, zeros, np.ones(n, np.float32), np.zeros(n, bool), zeros + np.nan)
     usable = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
     usable = np.pad(usable, radius)
     columns, rows = np.rint(pixels).astype(np.intp).T
@@ -197,7 +197,7 @@ def disparities_of_depths(
         valid.astype(np.float32),
         np.where(valid, sigma, 1.0).astype(np.float32),
         valid,
-        np.zeros(n, np.float32),
+        np.full(n, np.nan, np.float32),
     )
 
 

@@ -92,6 +92,15 @@ class StereoOdometry:
         """The disparity error (a₀, a₁) estimated so far; see `DisparityCalibration`."""
         return np.asarray(self._odometry.calibration.estimate())
 
+    @property
+    def right_late(self) -> tuple[float, float]:
+        """How much later than the left images the right ones were taken, and its standard deviation.
+
+        In frame intervals, from all frames so far; (0, 1) where nothing is known, as of a camera at rest or of features
+        given to `step_tracks`. Beyond `ImageChecks.max_late` frames are flagged `unsynchronised`.
+        """
+        return self._odometry.synchrony.late()
+
     def step(self, left: np.ndarray, right: np.ndarray) -> FrameEstimate:
         """Take the next stereo pair.
 
@@ -141,7 +150,7 @@ class StereoOdometry:
             valid.astype(np.float32),
             np.where(valid, sigma, np.float32(1)),
             valid,
-            np.zeros_like(disparity),
+            np.full_like(disparity, np.nan),
         )
         return self._odometry.step_tracks(ids, Measured(measurements[:, :2], matches))
 
