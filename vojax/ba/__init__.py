@@ -58,6 +58,7 @@ from ._two_view import homography_residual as homography_residual
 from ._two_view import pixel_rays as pixel_rays
 from ._two_view import to_rank_two as to_rank_two
 from ._two_view import translation_basis as translation_basis
+from ._whitening import whiten as whiten
 from ._whitening import whitening as whitening
 from ._window import Window as Window
 from ._window import adjust_window as adjust_window

@@ -111,12 +111,20 @@ def solve(system: ArrowSystem) -> tuple[Float[Array, "6 c"], Float[Array, "3 p"]
 
 
 def camera_covariances(system: ArrowSystem) -> tuple[Float[Array, "c 6 6"], Bool[Array, ""]]:
-    """Marginal covariances of the cameras: the diagonal blocks of S⁻¹; zero for cameras that are fixed."""
+    """Marginal covariances of the cameras: the diagonal blocks of S⁻¹; zero for cameras that are fixed.
+
+    False, and zeros, where a pivot of S is within the rounding error of what elimination took from it: the direction
+    has no information, whether or not the factorisation came through.
+    """
     c = system.camera.shape[-1]
     reduced = reduce(system)
+    # In scaled form the diagonal was one before. A free scale leaves up to 60 eps with three cameras; windows that
+    # determine their cameras have 0.01.
+    pivots = jnp.where(reduced.scale > 0, jnp.diag(reduced.factor) ** 2, 1.0)
+    regular = reduced.regular & (jnp.min(pivots) > 8 * len(pivots) * float(jnp.finfo(pivots.dtype).eps))
     full = reduced.solve_cameras(jnp.diag(jnp.where(reduced.scale > 0, 1.0, 0.0).astype(reduced.scale.dtype)))
     blocks = jnp.sum(full.reshape(6, c, 6, c) * jnp.eye(c, dtype=full.dtype)[None, :, None], axis=3)
-    return jnp.where(reduced.regular, blocks.transpose(1, 0, 2), 0.0), reduced.regular
+    return jnp.where(regular, blocks.transpose(1, 0, 2), 0.0), regular
 
 
 def normal_equations(blocks: Blocks) -> ArrowSystem:

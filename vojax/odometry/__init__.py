@@ -25,6 +25,7 @@ from ._relative_scale import relative_scale as relative_scale
 from ._rgbd import DepthOptions as DepthOptions
 from ._rgbd import RgbdOdometry as RgbdOdometry
 from ._rgbd import RgbdOdometryOptions as RgbdOdometryOptions
+from ._rig import RigOdometry as RigOdometry
 from ._sliding_window import WindowOptions as WindowOptions
 from ._stereo import StereoOdometry as StereoOdometry
 from ._stereo import StereoOdometryOptions as StereoOdometryOptions

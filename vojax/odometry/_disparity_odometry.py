@@ -61,6 +61,32 @@ class Measured(NamedTuple):
     pixels: np.ndarray
     matches: StereoMatches
 
+    def rows(self, rows: np.ndarray) -> "Measured":
+        """Some of the features, in this order."""
+        return Measured(self.pixels[rows], StereoMatches(*(field[rows] for field in self.matches)))
+
+
+def given_measurements(measurements: np.ndarray, sigma_disparity_px: float | np.ndarray) -> Measured:
+    """Features measured elsewhere, `(u_left, v, u_right)` [n, 3]; u_right not finite where there is none.
+
+    Raises:
+        ValueError: If the array has another shape.
+    """
+    measurements = np.asarray(measurements, np.float32)
+    if measurements.ndim != 2 or measurements.shape[1] != 3:
+        raise ValueError(f"measurements have shape {measurements.shape}: expected (u_left, v, u_right) [n, 3]")
+    disparity = measurements[:, 0] - measurements[:, 2]
+    valid = np.isfinite(disparity) & (disparity > 0)
+    sigma = np.broadcast_to(np.asarray(sigma_disparity_px, np.float32), disparity.shape)
+    matches = StereoMatches(
+        np.where(valid, disparity, np.float32(0)),
+        valid.astype(np.float32),
+        np.where(valid, sigma, np.float32(1)),
+        valid,
+        np.full_like(disparity, np.nan),
+    )
+    return Measured(measurements[:, :2], matches)
+
 
 class _Frame(NamedTuple):
     features: Features
@@ -141,18 +167,17 @@ class DisparityOdometry:
             ValueError: If a feature stands there twice or nowhere, or images came before.
         """
         features, order = given_features(ids, measured.pixels, self._reference and self._reference.features)
-        matches = StereoMatches(*(field[order] for field in measured.matches))
         self._size = room_for(len(order), self._size)
         few = len(order) < self._options.checks.min_features
         flags = (Flag.texture,) if few else ()
-        return self._take(features, Measured(features.pixels, matches), self._guess(), flags)
+        return self._take(features, measured.rows(order), self._guess(), flags)
 
     def _guess(self) -> SE3:
         """The motion since the reference, should the last one repeat itself."""
-        return self._motion if self._gap == 1 else _repeated(self._motion, float(self._gap))
+        return self._motion if self._gap == 1 else repeated(self._motion, float(self._gap))
 
     def _take(self, features: Features, measured: Measured, guess: SE3, flags: tuple[Flag, ...]) -> FrameEstimate:
-        frame = _Frame(features, measured, _padded(measured, self._size), features.pixels)
+        frame = _Frame(features, measured, padded_features(measured, self._size), features.pixels)
         reference = self._reference
         estimate = self._first(frame, flags) if reference is None else self._next(reference, frame, guess, flags)
         self._count += 1
@@ -193,7 +218,7 @@ class DisparityOdometry:
 
         flags += self._check_synchrony(reference, frame, inliers)
         self.calibration = motion.calibration
-        pose = orthonormal(self._pose @ np.asarray(_inverse_matrix(motion.cam1_from_cam0), np.float64))
+        pose = orthonormal(self._pose @ np.asarray(inverse_matrix(motion.cam1_from_cam0), np.float64))
         static = Flag.static in flags
         # Only depths make a reference: landmarks are triangulated there.
         advance = not static and int(frame.measured.matches.valid.sum()) >= checks.min_features
@@ -202,7 +227,7 @@ class DisparityOdometry:
             self._motion, self._gap = SE3.identity(), 1
         else:
             moved = motion.cam1_from_cam0
-            self._motion = moved if self._gap == 1 else _repeated(moved, 1.0 / self._gap)
+            self._motion = moved if self._gap == 1 else repeated(moved, 1.0 / self._gap)
         if advance:
             keyframe = self._is_keyframe(pose, frame, inliers, motion)
             if keyframe:
@@ -223,13 +248,11 @@ class DisparityOdometry:
 
     def _estimate(self, reference: _Frame, frame: _Frame, guess: SE3) -> Motion:
         rows = frame.features.rows
-        before = Measured(
-            reference.measured.pixels[rows], StereoMatches(*(field[rows] for field in reference.measured.matches))
-        )
+        before = reference.measured.rows(rows)
         options, size = self._options.motion, self._size
         quality = frame.features.quality
         arguments = (
-            _padded(before, size),
+            padded_features(before, size),
             frame.padded,
             jnp.asarray(np.pad(quality, (0, size - len(quality)))),
             guess,
@@ -251,7 +274,7 @@ class DisparityOdometry:
 
     def _ahead(self) -> np.ndarray:
         """The pose now, should the motion have repeated itself since the reference."""
-        return orthonormal(self._pose @ np.asarray(_inverse_matrix(self._guess()), np.float64))
+        return orthonormal(self._pose @ np.asarray(inverse_matrix(self._guess()), np.float64))
 
     def _bridge(self, flags: tuple[Flag, ...]) -> FrameEstimate:
         """Repeat the last motion; the reference stays."""
@@ -289,12 +312,12 @@ class DisparityOdometry:
 
 
 @eqx.filter_jit
-def _inverse_matrix(pose: SE3) -> jax.Array:
+def inverse_matrix(pose: SE3) -> jax.Array:
     return pose.inverse().as_matrix()
 
 
 @eqx.filter_jit
-def _repeated(motion: SE3, times: float) -> SE3:
+def repeated(motion: SE3, times: float) -> SE3:
     """A motion done some number of times, or a part of it."""
     return SE3.exp(motion.log() * times)
 
@@ -303,7 +326,7 @@ def _measurements(measured: Measured) -> np.ndarray:
     return np.column_stack([measured.pixels, measured.pixels[:, 0] - measured.matches.disparity]).astype(np.float32)
 
 
-def _padded(measured: Measured, size: int) -> StereoFeatures:
+def padded_features(measured: Measured, size: int) -> StereoFeatures:
     n = len(measured.pixels)
     measurements = np.zeros((size, 3), np.float32)
     measurements[:n] = _measurements(measured)

@@ -251,6 +251,38 @@ class TransferResiduals(eqx.Module):
         jacobian = jax.vmap(jax.jacfwd(lambda m: self.predict(pose, m)))(self.first)
         return noise1 + propagated(jacobian, noise0), jacobian
 
+    def agreement(self, pose: SE3, usable: Bool[Array, " n"]) -> "Agreement":
+        """Tell inliers from outliers at the final pose, and what they say of the disparity error.
+
+        Args:
+            pose: `cam1_from_cam0`.
+            usable: Features that can agree.
+        """
+        stereo, first, second = self.stereo, self.first, self.second
+        matched = self.features1.has_disparity
+        covariance, carried = self.covariances(pose)
+        information = jnp.moveaxis(symmetric_inverse(jnp.moveaxis(covariance, 0, -1))[0], -1, 0)
+        residual = jax.vmap(lambda m: self.predict(pose, m))(first) - self.observed(pose)
+        squared = jnp.sum(jnp.sum(information * residual[:, None, :], axis=2) * residual, axis=1)
+        points1 = pose.apply(stereo.unproject(first))
+        inliers = usable & (squared < self.options.max_mahalanobis**2) & (points1[:, 2] > 0)
+
+        weight = jnp.where(inliers, GemanMcClure(2.0).weight(squared), 0.0)
+        projection = jax.vmap(jax.jacfwd(stereo.project))(points1)  # [n, 3, 3]
+        by_rotation = jnp.cross(projection, points1[:, None, :])
+        terms0 = jnp.stack(disparity_terms(first[:, 0], stereo), axis=1)
+        terms1 = jnp.stack(disparity_terms(second[:, 0], stereo), axis=1)
+        # Offsets move u_right: down in the first frame, and where there is a match in the second.
+        by_offsets = -carried[:, :, 2, None] * terms0[:, None, :]
+        by_offsets = by_offsets.at[:, 2].add(matched.astype(first.dtype)[:, None] * terms1)
+        jacobian = jnp.concatenate([-projection, by_rotation, by_offsets], axis=2)  # [n, 3, 8]
+        weighted = weight[:, None, None] * jnp.sum(information[:, :, :, None] * jacobian[:, None], axis=2)
+        jacobian, weighted = jacobian.reshape(-1, 8), weighted.reshape(-1, 8)
+        hessian = jnp.matmul(jacobian.T, weighted, precision="highest")
+        gradient = jnp.sum(weighted * residual.reshape(-1, 1), axis=0)
+        depths = jnp.where(matched, stereo.unproject(second)[:, 2], points1[:, 2])
+        return Agreement(inliers, depths, hessian, gradient)
+
     def conclude(
         self,
         pose: SE3,
@@ -260,7 +292,7 @@ class TransferResiduals(eqx.Module):
         calibration: DisparityCalibration,
         offsets: Float[Array, "2"],
     ) -> Motion:
-        """Tell inliers from outliers at the final pose, and what they say of the disparity error.
+        """The motion with its inliers, and what they add to the calibration.
 
         Args:
             pose: `cam1_from_cam0`.
@@ -270,33 +302,27 @@ class TransferResiduals(eqx.Module):
             calibration: Disparity error known so far.
             offsets: What has been taken out of the measurements.
         """
-        stereo, first, second = self.stereo, self.first, self.second
-        matched = self.features1.has_disparity
-        covariance, carried = self.covariances(pose)
-        information = jnp.moveaxis(symmetric_inverse(jnp.moveaxis(covariance, 0, -1))[0], -1, 0)
-        residual = jax.vmap(lambda m: self.predict(pose, m))(first) - self.observed(pose)
-        squared = jnp.sum(jnp.sum(information * residual[:, None, :], axis=2) * residual, axis=1)
-        points1 = pose.apply(stereo.unproject(first))
-        inliers = usable & found & (squared < self.options.max_mahalanobis**2) & (points1[:, 2] > 0)
-
+        agreed = self.agreement(pose, usable & found)
         if self.options.self_calibrate:
-            weight = jnp.where(inliers, GemanMcClure(2.0).weight(squared), 0.0)
-            projection = jax.vmap(jax.jacfwd(stereo.project))(points1)  # [n, 3, 3]
-            by_rotation = jnp.cross(projection, points1[:, None, :])
-            terms0 = jnp.stack(disparity_terms(first[:, 0], stereo), axis=1)
-            terms1 = jnp.stack(disparity_terms(second[:, 0], stereo), axis=1)
-            # Offsets move u_right: down in the first frame, and where there is a match in the second.
-            by_offsets = -carried[:, :, 2, None] * terms0[:, None, :]
-            by_offsets = by_offsets.at[:, 2].add(matched.astype(first.dtype)[:, None] * terms1)
-            jacobian = jnp.concatenate([-projection, by_rotation, by_offsets], axis=2)  # [n, 3, 8]
-            weighted = weight[:, None, None] * jnp.sum(information[:, :, :, None] * jacobian[:, None], axis=2)
-            jacobian, weighted = jacobian.reshape(-1, 8), weighted.reshape(-1, 8)
-            hessian = jnp.matmul(jacobian.T, weighted, precision="highest")
-            gradient = jnp.sum(weighted * residual.reshape(-1, 1), axis=0)
-            calibration = calibration.add(hessian, gradient, offsets)
+            calibration = calibration.add(agreed.hessian, agreed.gradient, offsets)
+        count, num_usable = jnp.sum(agreed.inliers), jnp.sum(usable)
+        return Motion(pose, pose_covariance, agreed.inliers, count, num_usable, agreed.depths, calibration)
 
-        depths = jnp.where(matched, stereo.unproject(second)[:, 2], points1[:, 2])
-        return Motion(pose, pose_covariance, inliers, jnp.sum(inliers), jnp.sum(usable), depths, calibration)
+
+class Agreement(eqx.Module):
+    """What the features of a pair say at the final pose.
+
+    Attributes:
+        inliers: Features that agree.
+        depths: Of the features in the new frame, metres.
+        hessian: Gauss–Newton matrix by the pose (first six) and the disparity offsets.
+        gradient: Its right-hand side Jᵀr.
+    """
+
+    inliers: Bool[Array, " n"]
+    depths: Float[Array, " n"]
+    hessian: Float[Array, "8 8"]
+    gradient: Float[Array, "8"]
 
 
 @eqx.filter_jit

@@ -20,30 +20,32 @@ _PRIOR_SIGMA_PX = (0.3, 1.0)
 
 
 class DisparityCalibration(eqx.Module):
-    """What is known of (a₀, a₁): a Gaussian in information form.
+    """What is known of (a₀, a₁) of one pair or of several: a Gaussian in information form.
 
     Attributes:
         information: Inverse covariance, 1/px².
         vector: Information times the estimate, 1/px.
     """
 
-    information: Float[Array, "2 2"]
-    vector: Float[Array, "2"]
+    information: Float[Array, "m m"]
+    vector: Float[Array, " m"]
 
     @classmethod
-    def prior(cls) -> "DisparityCalibration":
+    def prior(cls, pairs: int = 1) -> "DisparityCalibration":
         """Before any frame: no error expected."""
-        return cls(jnp.diag(jnp.array(_PRIOR_SIGMA_PX) ** -2), jnp.zeros(2))
+        return cls(jnp.diag(jnp.array(_PRIOR_SIGMA_PX * pairs) ** -2), jnp.zeros(2 * pairs))
 
-    def estimate(self) -> Float[Array, "2"]:
-        """(a₀, a₁) in pixels."""
+    def estimate(self) -> Float[Array, " m"]:
+        """(a₀, a₁) in pixels, of one pair after the other."""
+        if self.vector.shape[0] > 2:
+            return jnp.linalg.solve(self.information, self.vector)
         (a, b), (_, d) = self.information
         determinant = a * d - b * b
         first, second = self.vector
         return jnp.stack([d * first - b * second, a * second - b * first]) / determinant
 
     def add(
-        self, hessian: Float[Array, "8 8"], gradient: Float[Array, "8"], at: Float[Array, "2"]
+        self, hessian: Float[Array, "p p"], gradient: Float[Array, " p"], at: Float[Array, " m"]
     ) -> "DisparityCalibration":
         """Add a frame's evidence.
 
@@ -54,8 +56,8 @@ class DisparityCalibration(eqx.Module):
         """
         pose = hessian[:6, :6] + 1e-6 * jnp.diag(jnp.diag(hessian[:6, :6]))
         explained = jnp.linalg.solve(pose, jnp.concatenate([hessian[:6, 6:], gradient[:6, None]], axis=1))
-        reduced = hessian[6:, 6:] - hessian[6:, :6] @ explained[:, :2]
-        rhs = gradient[6:] - hessian[6:, :6] @ explained[:, 2]
+        reduced = hessian[6:, 6:] - hessian[6:, :6] @ explained[:, :-1]
+        rhs = gradient[6:] - hessian[6:, :6] @ explained[:, -1]
         usable = jnp.all(jnp.isfinite(reduced)) & jnp.all(jnp.isfinite(rhs))
         share = jnp.where(usable, _EVIDENCE_SHARE, 0.0)
         reduced, rhs = jnp.where(usable, reduced, 0.0), jnp.where(usable, rhs, 0.0)

@@ -13,14 +13,13 @@ from vojax.cameras import RectifiedStereo
 from vojax.features import (
     DescriptorOptions,
     DetectorOptions,
-    StereoMatches,
     StereoOptions,
     TrackerOptions,
     match_stereo_rows,
     to_gray,
 )
 
-from ._disparity_odometry import DisparityOdometry, Measured
+from ._disparity_odometry import DisparityOdometry, Measured, given_measurements
 from ._frame import FrameEstimate
 from ._image_checks import ImageChecks
 from ._keyframes import KeyframeOptions
@@ -139,20 +138,7 @@ class StereoOdometry:
         Raises:
             ValueError: If the arrays do not fit together, a feature stands there twice, or images came before.
         """
-        measurements = np.asarray(measurements, np.float32)
-        if measurements.ndim != 2 or measurements.shape[1] != 3:
-            raise ValueError(f"measurements have shape {measurements.shape}: expected (u_left, v, u_right) [n, 3]")
-        disparity = measurements[:, 0] - measurements[:, 2]
-        valid = np.isfinite(disparity) & (disparity > 0)
-        sigma = np.broadcast_to(np.asarray(sigma_disparity_px, np.float32), disparity.shape)
-        matches = StereoMatches(
-            np.where(valid, disparity, np.float32(0)),
-            valid.astype(np.float32),
-            np.where(valid, sigma, np.float32(1)),
-            valid,
-            np.full_like(disparity, np.nan),
-        )
-        return self._odometry.step_tracks(ids, Measured(measurements[:, :2], matches))
+        return self._odometry.step_tracks(ids, given_measurements(measurements, sigma_disparity_px))
 
     def skip(self) -> FrameEstimate:
         """Bridge a pair that cannot be read: the last motion is repeated.
