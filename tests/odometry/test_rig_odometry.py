@@ -9,7 +9,15 @@ import pytest
 from vojax.cameras import Pinhole, RectifiedStereo
 from vojax.datasets import SyntheticStereoSequence
 from vojax.lie import SE3, SO3
-from vojax.odometry import Flag, MotionOptions, RigidMotionOptions, RigOdometry, StereoOdometry, StereoOdometryOptions
+from vojax.odometry import (
+    Flag,
+    MotionOptions,
+    PairRectifier,
+    RigidMotionOptions,
+    RigOdometry,
+    StereoOdometry,
+    StereoOdometryOptions,
+)
 from vojax.odometry._motion import StereoFeatures
 from vojax.odometry._rectification import DisparityCalibration
 from vojax.odometry._rig_motion import PairRig, rig_motion
@@ -183,6 +191,22 @@ def test_a_pair_that_sees_nothing_leaves_the_others_to_go_on(street):
     assert lost.bridged
     assert odometry.skip().flags == (Flag.unreadable,)
     assert not odometry.step([street.images(7)] * 2).bridged
+
+
+def test_the_mount_of_an_unrectified_pair_is_that_of_its_left_camera():
+    cam1_from_cam0 = SE3.exp(jnp.array([-0.4, 0.05, 0.02, 0.02, -0.03, 0.01]))
+    rectifier = PairRectifier(FRONT.camera, FRONT.camera, cam1_from_cam0, (WIDTH, HEIGHT))
+    assert np.linalg.norm(rectifier.rect_from_cam0 - np.eye(3)) > 0.05
+    turn = np.eye(4)
+    turn[:3, :3] = rectifier.rect_from_cam0
+    rect_from_rig = turn @ matrices(LEFT_FROM_RIG)[1]
+    odometry = RigOdometry([rectifier], SE3(LEFT_FROM_RIG.wxyz_xyz[1:]))
+    truth, points = path(6), surroundings(5)
+    for pose in truth:
+        rect_from_world = rect_from_rig @ np.linalg.inv(pose)
+        rows, exact = seen(rectifier.stereo, points @ rect_from_world[:3, :3].T + rect_from_world[:3, 3])
+        estimate = odometry.step_tracks([rows[:500]], [exact[:500]])
+    np.testing.assert_allclose(estimate.world_from_cam, truth[-1], atol=2e-3)
 
 
 @pytest.mark.parametrize(
