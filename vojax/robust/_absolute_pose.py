@@ -21,7 +21,7 @@ from ._engine import Consensus, search
 from ._estimate import Estimate
 from ._options import RansacOptions
 from ._pairs import about_middle, checked_observations, masked_pairs, matrix_lanes, root_mean_square, usable_noise
-from ._significance import SQRT_TAU, chance_in_image, even_odds
+from ._significance import chance_in_image, even_odds_in_pixels
 
 
 class AbsolutePoseEstimator(eqx.Module):
@@ -153,12 +153,7 @@ def _estimate(
     # missing from the covariance.
     sigma = root_mean_square(sigma_px, mask).astype(dtype)
     chance = chance_in_image(pixels, mask, options.threshold_px)
-    cut = even_odds(
-        jnp.sum(consensus.inliers),
-        jnp.sum(mask),
-        1.0 / (SQRT_TAU * sigma) ** 2,
-        chance / (jnp.pi * options.threshold_px**2),
-    )
+    cut = even_odds_in_pixels(consensus.inliers, mask, sigma, chance, options.threshold_px)
     front = jax.lax.stop_gradient(start.apply(centered)[:, 2] > 0)
     refined = refine_absolute_pose(
         start,

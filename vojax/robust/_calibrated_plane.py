@@ -46,7 +46,7 @@ from ._pairs import (
     single_precision,
     usable_noise,
 )
-from ._significance import SQRT_TAU, chance_in_image, even_odds
+from ._significance import chance_in_image, even_odds_in_pixels
 
 
 class ImagePlane(eqx.Module):
@@ -224,8 +224,7 @@ def _estimate(
 
     sigma = root_mean_square(sigma_px, mask).astype(dtype)
     chance = chance_in_image(pixels1, mask, options.threshold_px)
-    density = chance / (jnp.pi * options.threshold_px**2)
-    cut = even_odds(jnp.sum(consensus.inliers), jnp.sum(mask), 1.0 / (SQRT_TAU * sigma) ** 2, density)
+    cut = even_odds_in_pixels(consensus.inliers, mask, sigma, chance, options.threshold_px)
     problem_kind: Any = RotationProblem if rotates else HomographyProblem
     refined = refine_model(
         start,

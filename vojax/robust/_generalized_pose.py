@@ -41,7 +41,7 @@ from ._pairs import (
     single_precision,
     usable_noise,
 )
-from ._significance import SQRT_TAU, chance_in_image, even_odds
+from ._significance import chance_in_image, even_odds_in_pixels
 
 
 class GeneralizedPoseEstimator(eqx.Module):
@@ -173,12 +173,7 @@ def _estimate(
     sigma = root_mean_square(sigma_px, mask)
     # Each camera's image counts for chance as if all pixels were in one.
     chance = chance_in_image(pixels, mask, options.threshold_px)
-    cut = even_odds(
-        jnp.sum(consensus.inliers),
-        jnp.sum(mask),
-        1.0 / (SQRT_TAU * sigma) ** 2,
-        chance / (jnp.pi * options.threshold_px**2),
-    )
+    cut = even_odds_in_pixels(consensus.inliers, mask, sigma, chance, options.threshold_px)
     front = rig.into_cameras(start.apply(centered), camera_index)[:, 2] > 0
     problem = RigPoseProblem(centered, pixels, camera_index, rig, whitening(sigma_px, pixels.shape[:1], 2, dtype))
     refined = refine_model(

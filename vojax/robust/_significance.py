@@ -92,3 +92,23 @@ def even_odds(
     share = jnp.clip(share, 0.01, 0.99)
     odds = share * inlier_density / jnp.maximum((1.0 - share) * outlier_density, 1e-30)
     return jax.lax.stop_gradient(jnp.sqrt(2.0 * jnp.log(jnp.clip(odds, 1.7, 1e8))))
+
+
+def even_odds_in_pixels(
+    inliers: Bool[Array, " n"],
+    mask: Bool[Array, " n"],
+    sigma_px: Float[Array, ""],
+    chance: Float[Array, ""],
+    threshold_px: Float[Array, ""] | float,
+) -> Float[Array, ""]:
+    """`even_odds` of errors in an image, in two dimensions.
+
+    Args:
+        inliers: Supporters of the model.
+        mask: Observations that count.
+        sigma_px: Standard deviation of a pixel's coordinates.
+        chance: That an outlier is within the threshold, see `chance_in_image`.
+        threshold_px: The threshold.
+    """
+    density = chance / (jnp.pi * threshold_px**2)
+    return even_odds(jnp.sum(inliers), jnp.sum(mask), 1.0 / (SQRT_TAU * sigma_px) ** 2, density)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from vojax._numerics import cross3, dot3
 from vojax._types import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
-from vojax.ba import GaussianUniform, LMOptions, Loss, Tukey, polish_model, refine_model, robustify, whitening
+from vojax.ba import GaussianUniform, LMOptions, Loss, Tukey, polish_model, refine_model, robustify, whiten, whitening
 from vojax.lie import SE3, SO3
 
 from ._buckets import in_bucket
@@ -29,7 +29,7 @@ from ._engine import search
 from ._estimate import Estimate
 from ._options import RansacOptions
 from ._pairs import about_middle, checked_observations, masked_pairs, root_mean_square, single_precision, usable_noise
-from ._significance import SQRT_TAU, chance_in_image, even_odds
+from ._significance import chance_in_image, even_odds_in_pixels
 
 
 class TranslationProblem(eqx.Module):
@@ -53,11 +53,7 @@ class TranslationProblem(eqx.Module):
     def errors(self, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
         """The same of points in the camera's frame."""
         u, v = self.camera.project_xyz(x, y, z)
-        du, dv = u - self.pixels[:, 0], v - self.pixels[:, 1]
-        if len(self.whitening) == 1:
-            return self.whitening[0] * du, self.whitening[0] * dv
-        a, b, c = self.whitening
-        return a * du, b * du + c * dv
+        return whiten(self.whitening, (u - self.pixels[:, 0], v - self.pixels[:, 1]))
 
 
 class TranslationEstimator(eqx.Module):
@@ -205,8 +201,7 @@ def _estimate(
 
     # All observations in front take part, weighted by how likely they are inliers, as for `estimate_absolute_pose`.
     sigma, chance = root_mean_square(sigma_px, mask).astype(dtype), chance_in_image(pixels, mask, options.threshold_px)
-    density = chance / (jnp.pi * options.threshold_px**2)
-    cut = even_odds(jnp.sum(consensus.inliers), jnp.sum(mask), 1.0 / (SQRT_TAU * sigma) ** 2, density)
+    cut = even_odds_in_pixels(consensus.inliers, mask, sigma, chance, options.threshold_px)
     start = consensus.model[:3].astype(dtype)
     front = jax.lax.stop_gradient(centered + start[None])[:, 2] > 0
     problem = TranslationProblem(centered, pixels, camera, whitening(sigma_px, mask.shape, 2, dtype))
