@@ -404,7 +404,8 @@ def test_more_windows_than_lanes_end_as_they_do_a_few_at_a_time():
     assert np.ptp(joined.iterations) >= 2  # lanes are taken over at different times
     assert np.max(np.abs(together.iterations - joined.iterations)) <= 1  # rounding differs between the two programs
     np.testing.assert_array_equal(together.result == Result.success, joined.result == Result.success)
-    np.testing.assert_allclose(together.cost, joined.cost, rtol=1e-5)
+    resolved = 256 * float(jnp.finfo(jnp.float32).eps)  # the tolerance at which a float32 solve ends
+    np.testing.assert_allclose(together.cost, joined.cost, rtol=resolved)
     np.testing.assert_allclose(together.world_from_cam.wxyz_xyz, joined.world_from_cam.wxyz_xyz, atol=2e-5)
 
 

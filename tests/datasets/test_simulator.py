@@ -147,3 +147,14 @@ def test_one_frame_and_other_bad_input():
         motion_profile(0, key=KEY)
     with pytest.raises(ValueError, match=r"outlier_fraction is 1\.5"):
         simulate_absolute_pose(KEY, 5, outlier_fraction=1.5)
+
+
+def test_the_dtype_asked_for_is_that_of_everything_also_where_jax_has_doubles(x64):
+    problems = (
+        simulate_absolute_pose(KEY, 20, dtype=jnp.float32),
+        simulate_relative_pose(KEY, 20, dtype=jnp.float32),
+        simulate_rigid(KEY, 20, dtype=jnp.float32),
+        simulate_stereo_window(KEY, 3, 20, dtype=jnp.float32),
+    )
+    numbers = [leaf for leaf in jax.tree.leaves(problems) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    assert {leaf.dtype for leaf in numbers} == {jnp.dtype(jnp.float32)}

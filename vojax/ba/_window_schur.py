@@ -83,7 +83,8 @@ def reduce(system: ArrowSystem) -> Reduced:
     informed = diagonal > 0
     scale = jnp.where(informed, jax.lax.rsqrt(jnp.where(informed, diagonal, 1.0)), 0.0)
     scaled = scale[:, None] * full * scale[None, :] + jnp.diag(jnp.where(informed, 0.0, 1.0).astype(full.dtype))
-    factor = jnp.linalg.cholesky(scaled, symmetrize_input=False)
+    # LAPACK takes columns first: the other triangle, which is the same, is written as it is read.
+    factor = jnp.linalg.cholesky(scaled.T, symmetrize_input=False)
     regular = jnp.isfinite(factor[-1, -1])  # all of it is NaN where the factorisation failed
     factor = jnp.where(regular, factor, jnp.eye(6 * c, dtype=full.dtype))
     return Reduced(factor, scale, eliminated, root, regular)
@@ -142,12 +143,12 @@ def normal_equations(blocks: Blocks) -> ArrowSystem:
     turned = jnp.stack([jnp.stack([dot(normal[i], turn[:, j]) for j in three]) for i in three])  # A R
     rows = jnp.concatenate([-turned, cross(turned, x[:, None])])
     by_turn = cross(normal, x[:, None])  # [X]×ᵀ A
-    corner = jnp.sum(cross(by_turn.swapaxes(0, 1), x[:, None]), axis=-1)
-    straight, mixed = jnp.sum(normal, axis=-1), -jnp.sum(by_turn, axis=-1)
+    corner = _total(cross(by_turn.swapaxes(0, 1), x[:, None]))
+    straight, mixed = _total(normal), -_total(by_turn)
     camera = jnp.concatenate(
         [jnp.concatenate([straight, mixed.swapaxes(0, 1)], axis=1), jnp.concatenate([mixed, corner], axis=1)]
     )
-    camera_gradient = jnp.concatenate([-jnp.sum(by_point, axis=-1), jnp.sum(cross(by_point, x), axis=-1)])
+    camera_gradient = jnp.concatenate([-_total(by_point), _total(cross(by_point, x))])
     landmark = [[jnp.sum(dot(turn[:, i], turned[:, j]), axis=0) for j in three] for i in three]
     landmark_gradient = [jnp.sum(dot(turn[:, i], by_point), axis=0) for i in three]
     prior = blocks.prior_by_pose
@@ -184,6 +185,11 @@ class SchurDescent(optx.AbstractDescent):
     def step(self, step_size: Any, state: ArrowSystem) -> tuple[Any, optx.RESULTS]:
         """Solve for the step at damping 1/step_size."""
         return solve(state.damped(1.0 / step_size)), optx.RESULTS.successful
+
+
+def _total(x: Float[Array, "*rows p"]) -> Float[Array, "*rows"]:
+    """Sum over landmarks as a product with ones: XLA cuts sums of more than 32 numbers into two passes."""
+    return jnp.matmul(x, jnp.ones(x.shape[-1:], x.dtype), precision="highest")
 
 
 def _diagonal(coupling: Float[Array, "6 c 6 c"]) -> Float[Array, "6 c"]:

@@ -114,6 +114,8 @@ class WindowLevenbergMarquardt(UntilConverged):
             _Evaluation(trial),  # type: ignore[arg-type]
             state.search_state,
         )
+        # Numbers for all that follows: without a barrier XLA works them out anew for every element.
+        step_size, accept, search_state = jax.lax.optimization_barrier((step_size, accept, search_state))
         keep = lambda new, old: jnp.where(accept, new, old)  # noqa: E731
         y = jax.tree.map(keep, state.y_eval, y)
         blocks = jax.tree.map(keep, trial, state.blocks)

@@ -302,7 +302,7 @@ def simulate_stereo_window(
 def _default_camera(image_size: ImageSize, dtype: Any, focal: float = 800.0) -> Pinhole:
     width, height = image_size
     fx, cx, cy = (jnp.asarray(value, dtype) for value in (focal, (width - 1) / 2, (height - 1) / 2))
-    return Pinhole(fx=fx, fy=fx, cx=cx, cy=cy)
+    return Pinhole(fx=fx, fy=fx, cx=cx, cy=cy, skew=jnp.zeros((), dtype))
 
 
 def _draws(key: PRNGKeyArray, n: int, columns: int, dtype: Any) -> tuple[Array, Array]:
